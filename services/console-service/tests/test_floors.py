@@ -4,6 +4,7 @@ import asyncio
 import time
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import SimpleNamespace
 
 import httpx
@@ -294,6 +295,10 @@ def test_list_of_floors_that_can_t_be_used_is_refused_with_the_reason(tmp_path, 
     (tmp_path / "floors.toml").write_text(text)
     with pytest.raises(SettingsError, match=said):
         read_peers(tmp_path / "floors.toml", "here")
+
+
+def test_list_of_a_floor_in_containers_is_empty_until_somebody_writes_it():
+    assert read_peers(Path(__file__).parents[3] / "deploy" / "floors" / "floors.toml", "here") == []
 
 
 def test_all_machines_may_have_the_same_list_and_each_leaves_itself_out(tmp_path):

@@ -52,6 +52,7 @@ DROPPED: Final = frozenset({"build", "pull_policy", "depends_on", "restart", "se
 """What Swarm does not know, or does in its own way: it starts all at once, and again until they run."""
 HEALTH: Final = {"timeout": "10s", "retries": 6}
 """Swarm kills, and forgets the name of, what compose only calls unhealthy: a busy machine must not lose its store."""
+_DEFAULT: Final = re.compile(r"^\$\{\w+:-(.+)\}$")
 _MOUNTED: Final = re.compile(r"^(?P<source>.+):(?P<target>/[^:]*)(:ro)?$")
 _SITE: Final = "/site"
 _NAME: Final = 64
@@ -236,7 +237,7 @@ class _Stack:
         for text in base.get("volumes", []):
             found = _MOUNTED.match(text)
             assert found is not None, f"{BASE}: {text} is no mount"
-            source, target = found["source"], found["target"]
+            source, target = _DEFAULT.sub(r"\1", found["source"]), found["target"]
             if source.endswith("-locks"):
                 for file, data in self._secrets[name].items():
                     key = self._add("secrets", f"{name}/{file}", data)

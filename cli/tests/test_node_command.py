@@ -205,6 +205,8 @@ def new_board(floor: Path, *words: str) -> Result:
         (["--wifi-password", "", "--fog-host", "0.0.0.0", "--locks", "LOCKS"], "no board connects to that"),
         (["--wifi-password", "", "--fog-host", "255.255.255.255", "--locks", "LOCKS"], "no board connects to that"),
         (["--wifi-password", "", "--fog-host", "fd00::5", "--locks", "LOCKS"], "own IPv4 address"),
+        (["--wifi-password", "", "--fog-host", "10.0.0.1,10.0.0.2,10.0.0.3", "--no-tls"], "knows fewer"),
+        (["--wifi-password", "", "--fog-host", "10.0.0.1,localhost", "--no-tls"], "that is the board itself"),
         (["--wifi-password", "short12", "--fog-host", "192.168.7.1", "--no-tls"], "has 7 characters"),
         (["--wifi-password", "g" * 64, "--fog-host", "192.168.7.1", "--no-tls"], "has 64 characters"),
         (["--wifi", "", "--wifi-password", "", "--fog-host", "192.168.7.1", "--no-tls"], "1 to 32 bytes"),

@@ -31,13 +31,13 @@ void BoardLink::begin(const char* authority) {
         transport_ = &transport;
     }
     client_.use(*transport_);
-    client_.setServer(settings_.broker, settings_.port);
+    client_.setServer(broker_, settings_.port);
     client_.setClientId(client_id_);
     if (settings_.user[0] != 0) client_.setCredentials(settings_.user, settings_.password);
     client_.setWill(availability_, FOGNAV_NODE_AVAILABILITY_QOS, true, FOGNAV_NODE_AVAILABILITY_OFFLINE);
     client_.onConnect([this](bool) {
         accepted_ = true;
-        Serial.printf(IN_FLASH("connected to the broker at %s\n"), settings_.broker);
+        Serial.printf(IN_FLASH("connected to the broker at %s\n"), broker_);
     });
     client_.onDisconnect([this](espMqttClientTypes::DisconnectReason reason) {
         failed_ = true;
@@ -79,8 +79,13 @@ void BoardLink::join_network() {
 }
 
 void BoardLink::connect_broker() {
+    if (tried_ && settings_.second_broker[0] != 0) {
+        broker_ = broker_ == settings_.broker ? settings_.second_broker : settings_.broker;
+        client_.setServer(broker_, settings_.port);
+    }
+    tried_ = true;
     // Certificates have dates, and the board has no clock of its own: the fog node tells it the time.
-    if (settings_.tls) configTime(0, 0, settings_.broker);
+    if (settings_.tls) configTime(0, 0, broker_);
     joining_ = false;
     accepted_ = false;
     failed_ = !client_.connect();

@@ -31,7 +31,8 @@ public:
 
 class BoardLink final : public Link {
 public:
-    BoardLink(const Settings& settings, Receiver& receiver) : settings_(settings), receiver_(receiver) {}
+    BoardLink(const Settings& settings, Receiver& receiver)
+        : settings_(settings), receiver_(receiver), broker_(settings.broker) {}
 
     // Prepare the client of the broker, which trusts this certificate authority (PEM) and no other.
     void begin(const char* authority);
@@ -71,6 +72,8 @@ private:
 
     const Settings& settings_;
     Receiver& receiver_;
+    const char* broker_;  // the one that was tried last, of two
+    bool tried_ = false;
     Inbox inbox_;
     BrokerClient client_;
     BrokerTransport* transport_ = nullptr;

@@ -218,6 +218,19 @@ def test_node_comes_back_after_a_loss_and_announces_itself_again(switch_on):
     assert published(board.run(60), ch.NODE_AVAILABILITY) == ["online"]
 
 
+def test_node_of_a_floor_with_two_brokers_tries_both_in_turn(switch_on):
+    board = switch_on({**TLS, "broker": "nowhere.lan", "second_broker": "fog.lan"}, authority=PEM)
+    board.tell("certificate fog.lan")
+    lines = board.run(30)
+    assert [line for line in lines if line.startswith("server")] == ["server fog.lan 8883"]
+    assert "time from fog.lan" in lines
+    assert "serial connected to the broker at fog.lan" in lines
+    board.tell("broker 0", "run 20000", "broker 1")
+    lines = board.run(60)
+    assert "server nowhere.lan 8883" in lines
+    assert "serial connected to the broker at fog.lan" in lines
+
+
 def test_board_restarts_after_ten_minutes_without_a_broker(switch_on):
     board = switch_on(SETTINGS)
     board.tell("broker 0")

@@ -45,11 +45,11 @@ _ITERATIONS: Final = 20_000
 
 @dataclass(frozen=True)
 class Access:
-    """How a board reaches the broker: Wi-Fi, the fog node's name, and whether the connection is encrypted."""
+    """How a board reaches the broker: Wi-Fi, one or two fog nodes' names, and whether the connection is encrypted."""
 
     wifi_name: str
     wifi_password: str
-    broker: str
+    brokers: list[str]
     port: int
     tls: bool
 
@@ -66,7 +66,7 @@ def settings(site: str, node: NodeSite, access: Access, password: str, profile: 
         "node": node.id,
         "wifi_name": access.wifi_name,
         "wifi_password": access.wifi_password,
-        "broker": access.broker,
+        **dict(zip(("broker", "second_broker"), access.brokers, strict=False)),
         "port": access.port,
         "tls": access.tls,
         "user": node.id,
@@ -198,6 +198,7 @@ _WIFI_NAME_BYTES: Final = 32
 _WIFI_PASSWORD: Final = re.compile(r"[ -~]{8,63}|[0-9A-Fa-f]{64}")
 """Of WPA2: a shorter one is no access point's, and no board's library takes a longer one."""
 _HOST_NAME: Final = re.compile(r"(?=.{1,64}\Z)([A-Za-z0-9-]+\.)*[A-Za-z0-9-]*[A-Za-z][A-Za-z0-9-]*")
+_BROKERS: Final = 2
 _IP: Final = 4
 """The boards' libraries are built without IPv6."""
 _NOBODYS: Final = (0, 2**32 - 1)
@@ -222,7 +223,10 @@ class BoardOptions:
     fog_host: Annotated[
         str | None,
         typer.Option(
-            "--fog-host", metavar="HOST", help="The fog node's address in the boards' network. Asked for, if not given."
+            "--fog-host",
+            metavar="HOST",
+            help="The fog node's address in the boards' network; of a floor with two copies two, after a comma. "
+            "Asked for, if not given.",
         ),
     ] = None
     tls: Annotated[bool, typer.Option("--tls/--no-tls", help="Whether the broker's connections are encrypted.")] = True
@@ -261,8 +265,12 @@ class BoardOptions:
         if host is None:
             host = _asked("The fog node's address in the boards' network", "--fog-host")
         self._check_wifi(password)
-        self._check_host(host)
-        self._check_trust(host)
+        hosts = host.split(",")
+        if len(hosts) > _BROKERS or (self.firmware == "esphome" and len(hosts) > 1):
+            raise WrongUseError(f"--fog-host {host}: a board of this firmware knows fewer. Leave some out")
+        for each in hosts:
+            self._check_host(each)
+            self._check_trust(each)
         return replace(self, wifi_password=password, fog_host=host)
 
     def _check_wifi(self, password: str) -> None:
@@ -334,7 +342,7 @@ class BoardOptions:
         if self.wifi_password is None or self.fog_host is None:
             raise TypeError("these options are not complete: see `completed`")
         port = _TLS_PORT if self.tls else _OPEN_PORT
-        access = Access(self.wifi, self.wifi_password, self.fog_host, port, self.tls)
+        access = Access(self.wifi, self.wifi_password, self.fog_host.split(","), port, self.tls)
         members = settings(loaded.site.id, node, access, new_password(), self.profile)
         if (folder := credentials_folder(self.security)) is not None:
             with security_errors():

@@ -83,7 +83,10 @@ private:
     // open, and is not told what opens the one before.
     bool replaced(const char* key, size_t length) const {
         if (is(key, length, "wifi_password") && given(form_.field("wifi_name"))) return true;
-        if ((is(key, length, "user") || is(key, length, "password")) && given(form_.field("broker"))) return true;
+        static constexpr const char* kOfBroker[] = {"second_broker", "user", "password"};
+        for (const char* name : kOfBroker) {
+            if (is(key, length, name) && given(form_.field("broker"))) return true;
+        }
         for (const char* name : kTexts) {
             if (is(key, length, name)) return given(form_.field(name));
         }

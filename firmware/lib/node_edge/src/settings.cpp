@@ -94,7 +94,7 @@ private:
         static constexpr Entry kEntries[] = {
             {"site", &Reader::site}, {"node", &Reader::node},
             {"wifi_name", &Reader::wifi_name}, {"wifi_password", &Reader::wifi_password},
-            {"broker", &Reader::broker}, {"port", &Reader::port}, {"tls", &Reader::tls},
+            {"broker", &Reader::broker}, {"second_broker", &Reader::second_broker}, {"port", &Reader::port}, {"tls", &Reader::tls},
             {"user", &Reader::user}, {"password", &Reader::password},
             {"thesis_area", &Reader::thesis_area}, {"home_assistant", &Reader::home_assistant},
             {"every_reading", &Reader::every_reading}, {"temperature_c", &Reader::temperature},
@@ -109,6 +109,7 @@ private:
     void wifi_name() { text(settings_.wifi_name); }
     void wifi_password() { text(settings_.wifi_password); }
     void broker() { text(settings_.broker); }
+    void second_broker() { text(settings_.second_broker); }
     void user() { text(settings_.user); }
     void password() { text(settings_.password); }
     void tls() { json_.boolean(settings_.tls); }

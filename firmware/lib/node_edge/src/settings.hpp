@@ -41,6 +41,7 @@ struct Settings {
     char wifi_name[kNameSize] = "";
     char wifi_password[kPasswordSize] = "";
     char broker[kNameSize] = "";  // a name or an address
+    char second_broker[kNameSize] = "";  // of a floor with two: they are tried in turn
     uint16_t port = 8883;
     bool tls = true;  // with the certificate authority in the file ca.pem, and no other
     char user[kNameSize] = "";

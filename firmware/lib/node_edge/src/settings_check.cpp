@@ -106,7 +106,7 @@ const char* settings_problem(const BoardPins& board, const Settings& settings) {
     if (!valid_id(settings.node)) return IN_FLASH("node is missing, or not made of a to z, 0 to 9 and -");
     if (settings.wifi_name[0] == 0) return IN_FLASH("wifi_name is missing");
     if (settings.broker[0] == 0) return IN_FLASH("broker is missing: the name or address of the fog node");
-    if (!board.finds_local && is_local(settings.broker)) {
+    if (!board.finds_local && (is_local(settings.broker) || is_local(settings.second_broker))) {
         return IN_FLASH("broker is a name in .local, which this board can't look up: give the fog node's address");
     }
     if (settings.sonars == 0) return IN_FLASH("sonars is missing: at least one");

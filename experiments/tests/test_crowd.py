@@ -6,11 +6,14 @@ FOGNAV_CROWD_SEEDS sets the number of drives.
 import math
 import os
 
+import msgspec
 import numpy as np
 import pytest
 import ring_site as ring
 
 from fog_contracts.messages import SimObstacle
+from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec
+from fognav_experiments.comparison.people import people_drive, people_tasks, publish
 
 pytestmark = pytest.mark.timeout(900)
 SEEDS = int(os.environ.get("FOGNAV_CROWD_SEEDS", "2"))
@@ -128,3 +131,20 @@ def test_robot_among_walking_people_touches_none_and_arrives_or_says_why_it_stan
             assert run.robot.command("enable").accepted
     assert run.state.goal_reached, run.state
     assert world.contacts == 0
+
+
+@pytest.mark.drive
+def test_a_drive_among_people_tells_what_nodes_reported_of_them_and_what_they_cost(tmp_path):
+    spec = ExperimentSpec(routes=[RouteSpec(start="west", goal="east", areas=["z1"])])
+    drives = [people_drive(ring.ring_site(), "", task) for task in people_tasks(spec, 1, 1, [4])]
+    assert all(drive.success and not drive.contacts for drive in drives), drives
+    among, alone = drives
+    assert min(among.closest_m, alone.closest_m) > 0.0
+    found = among.episodes
+    assert found.blocks
+    assert found.passed >= found.passed_reported > 0
+    assert found.missed_seen == 0, "who stands in a cone is seen"
+    assert alone.episodes.blocks == 0, "without nodes nobody reports anything"
+    free = msgspec.structs.replace(among, people=0, distance_m=among.distance_m - 1.5)
+    page = publish([free, *drives], "fognav experiment people", {}, tmp_path)[0].read_text("utf-8")
+    assert "| 4 | fog | 1, 1 | 1.50 | 0.00 |" in page

@@ -15,10 +15,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from fognav_experiments.comparison.drives import MeasuredDrive
+    from fognav_experiments.comparison.people import PeopleDrive
     from fognav_experiments.comparison.records import DriveFiles, Record
     from fognav_experiments.comparison.sensitivity import SweptDrive
 
-    D = TypeVar("D", Record, MeasuredDrive, SweptDrive)
+    D = TypeVar("D", Record, MeasuredDrive, SweptDrive, PeopleDrive)
 
 
 def prepare() -> None:

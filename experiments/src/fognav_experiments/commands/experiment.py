@@ -15,7 +15,7 @@ from fognav.operate.fog import find_fog
 from fognav.operate.options import FogOption, JsonOption, RobotOption  # noqa: TC001  # Typer reads annotations at run time
 from fognav.output import NOT_TRUE, WrongUseError, exit_codes, print_json, print_line
 from fognav_experiments.commands.driving import count_failed, measured_on, prepare, show
-from fognav_experiments.commands.sensitivity import sensitivity_command, sensors_command
+from fognav_experiments.commands.sensitivity import people_command, sensitivity_command, sensors_command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -34,6 +34,9 @@ experiment_app.command(
 experiment_app.command(
     "sensors", epilog="Example: fognav experiment sensors docs/results/estig-floor/drives.jsonl.xz --out sensors"
 )(sensors_command)
+experiment_app.command("people", epilog="Example: fognav experiment people --out people --people 0,5,20 --runs 10")(
+    people_command
+)
 
 
 def add_to(app: typer.Typer) -> None:

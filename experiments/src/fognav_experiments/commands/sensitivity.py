@@ -1,4 +1,4 @@
-"""`fognav experiment sensitivity`: sweep the quantities on which what the fog saves depends."""
+"""`fognav experiment sensitivity`, `sensors` and `people`: on what it depends what the fog saves."""
 
 from __future__ import annotations
 
@@ -117,6 +117,50 @@ def sensors_command(
                 print_line(str(file))
         except (records.FolderError, SiteError, OSError) as error:
             raise WrongUseError(str(error)) from error
+
+
+def people_command(
+    *,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of records and report.")],
+    people: Annotated[
+        str, typer.Option("--people", metavar="N,N", help="People on the floor; 0 is what others compare with.")
+    ] = "0,1,5,10,20",
+    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Drives of each number and setup.")] = 10,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
+    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", min=1, help="Drives at a time; all cores.")] = None,
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
+) -> None:
+    """Drive the first route among walking people, led by the fog and without it.
+
+    The report tells which blocks only passers-by made, who stood before a node unseen, and what people cost a robot.
+    Drives that were killed go on when the command is repeated, and more --runs add to those that are there.
+    """
+    from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison import people as among  # noqa: PLC0415  # same
+    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import DriveFiles, Folder, FolderError  # noqa: PLC0415  # same
+
+    command = f"fognav experiment people --people {people} --runs {runs} --seed {seed} --out DIR"
+    with exit_codes():
+        counts = [int(number) for number in _values(people)]
+        try:
+            place = checkout.site_folder(site)
+            loaded = load_site(place)
+            asked = among.people_tasks(runner.read_spec(loaded, place), seed, runs, counts)
+            folder = Folder(out)
+            folder.begin(runner.new(loaded, place, seed), measured_on())
+            files = DriveFiles(folder.path / "people", among.PeopleDrive)
+        except (SiteError, runner.SpecError, FolderError) as error:
+            raise WrongUseError(str(error)) from error
+        prepare()
+        names = [task.name for task in asked]
+        drives = among.people_drives(loaded, asked, files, jobs or os.cpu_count() or 1, checkout.revision())
+        failed = show(names, files, drives)
+        found = [drive for drive in files.read() if drive.name in names]
+        for file in among.publish(found, command, folder.description()["measured_on"], folder.path):
+            print_line(str(file))
+    if failed:
+        raise typer.Exit(NOT_TRUE)
 
 
 def _sweep(  # what is driven, where and how

@@ -1,0 +1,450 @@
+"""People who walk through beams and paths: what nodes report of them, and what they cost a robot.
+
+The same routes are driven among more and more people (`fognav_sim.people`), by a robot that the fog leads and by one on
+its own, in lockstep. People are the same at the start, and then react to the robot, so that drives of one seed differ.
+"""
+
+from __future__ import annotations
+
+import lzma
+import math
+from collections import Counter
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import msgspec
+import numpy as np
+
+from fog_contracts.cones import sonar_cones
+from fog_contracts.geometry import contains_point, distance_to_polygon
+from fog_contracts.messages import ReasonCode
+from fog_runtime.files import SHARED, atomic_write
+from fognav_experiments.comparison.drives import ALONE, PROFILE_OF_SETUP, DrivenRoute, draw, ends_of, start_of
+from fognav_experiments.figures import (
+    Block,
+    Code,
+    Heading,
+    Paragraph,
+    Picture,
+    Table,
+    bars,
+    captioned,
+    clustered,
+    flat,
+    spread,
+    to_markdown,
+    told,
+)
+from fognav_experiments.lockstep import ready, release_drives
+from fognav_experiments.machine import results
+from fognav_sim.drive.drive import DriveOutcome
+from fognav_sim.hardware import STEP_S
+from fognav_sim.people import BODY_M, FROM_ROBOT_M, SPEED_M_S, STANDS_S, People
+from fognav_sim.people import STEP_S as PEOPLE_S
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from fog_runtime.configuration.site import LoadedSite
+    from fognav_experiments.comparison.drives import ExperimentSpec, RouteDraw, Setup
+    from fognav_experiments.comparison.records import DriveFiles
+    from fognav_experiments.figures import Estimate
+    from fognav_experiments.lockstep import LockstepDrive
+
+SETUPS: Final[tuple[Setup, ...]] = ("fog", "lean")
+"""A robot that the fog leads, and the control: one on its own at the same rates."""
+MISSED_S: Final = 2.0
+"""Who stands in an area for longer than this should be reported: confirming takes up to about half a second."""
+EGRESS_S: Final = 5.0
+"""After this long in a blocked area an operator who sees it lets the robot out."""
+_REPORTED_S: Final = 1.0
+"""Of somebody who has gone a node may still report for so long."""
+_OBSERVED_STEPS: Final = 10
+_MOVES_M_S: Final = 0.02
+
+
+class Episodes(msgspec.Struct, kw_only=True):
+    """What nodes reported of people, over all areas of a drive.
+
+    `blocks`: how often an area became blocked; `passing`: by people of whom none stood there meanwhile; `empty`: with
+    nobody in the area at all. `passing_s`: how long (s) areas were blocked by these two. `stood`: how often somebody
+    stood in an area for `MISSED_S`; `missed`: of these, those during whom it was never blocked; `stood_seen`,
+    `missed_seen`: the same of those who stood in a cone of its node. `passed`: how often somebody walked through a
+    cone; `passed_reported`: of these, those during whom or within 1 s the area was blocked.
+    """
+
+    blocks: int = 0
+    passing: int = 0
+    empty: int = 0
+    passing_s: float = 0.0
+    stood: int = 0
+    missed: int = 0
+    stood_seen: int = 0
+    missed_seen: int = 0
+    passed: int = 0
+    passed_reported: int = 0
+
+
+class PeopleDrive(DrivenRoute, frozen=True, kw_only=True):
+    """One drive among people.
+
+    `people`: how many are on the floor. `closest_m`: least distance between the robot's rim and a person, and
+    `closest_moving_m` while the robot moved. `contacts`: of the robot with anybody or anything, as far as it drove into
+    them. `stood_s`: how long (s) it stood on its way. `modes`: how often it entered each mode, `modes_s`: for how long
+    (s). `stops`: its protective stops and faults; `egresses`: how often an operator let it out of a blocked area.
+    """
+
+    people: int
+    reason: str
+    closest_m: float | None
+    closest_moving_m: float | None
+    contacts: int
+    min_clearance_m: float | None
+    stood_s: float
+    paths: int
+    route_areas: list[str]
+    modes: dict[str, int]
+    modes_s: dict[str, float]
+    stops: list[str]
+    operator_commands: int
+    egresses: int
+    episodes: Episodes
+
+    @property
+    def name(self) -> str:
+        """Name of the record's file, without suffix."""
+        return PeopleTask.named(self.run, self.route, self.setup, self.people)
+
+
+class PeopleTask(NamedTuple):
+    """A drive to run."""
+
+    drawn: RouteDraw
+    setup: Setup
+    people: int
+
+    @property
+    def name(self) -> str:
+        """Name of its record."""
+        return self.named(self.drawn.run, self.drawn.route.name, self.setup, self.people)
+
+    @staticmethod
+    def named(run: int, route: str, setup: str, people: int) -> str:
+        """Return the name of a drive's record."""
+        return f"{run:04}-{route}-{setup}-{people:02}"
+
+
+def people_tasks(spec: ExperimentSpec, seed: int, runs: int, counts: Sequence[int]) -> list[PeopleTask]:
+    """Return the drives, run by run: each is of the site's first route, with a heading and noise of its own."""
+    drawn = [draw(spec, seed, run)[0] for run in range(1, runs + 1)]
+    return [PeopleTask(route, setup, count) for route in drawn for count in counts for setup in SETUPS]
+
+
+@dataclass
+class _Block:
+    """An area is blocked: since when (s), and whether somebody was there meanwhile, and stood there."""
+
+    since: float
+    occupied: bool
+    stood: bool
+
+
+@dataclass
+class _Stay:
+    """Somebody stands in an area or walks through a cone: since and until when (s), reported, and seen by a cone."""
+
+    since: float
+    until: float
+    reported: bool = False
+    seen: bool = False
+
+
+class _Observer:
+    """Compares what nodes report with who is there."""
+
+    def __init__(self, site: LoadedSite) -> None:
+        cones = sonar_cones(site.site.nodes, site.map)
+        self._areas = {area.id: area.polygon for area in site.site.areas}
+        self._cones = {
+            area: [cone for node in site.site.nodes if node.area == area for cone in cones[node.id]]
+            for area in self._areas
+        }
+        self._found = Episodes()
+        self._blocks: dict[str, _Block] = {}
+        self._standing: dict[tuple[str, int], _Stay] = {}
+        self._passing: dict[tuple[str, int], _Stay] = {}
+
+    def observe(self, now: float, people: People, states: Mapping[str, str]) -> None:
+        """Take note of who is where at `now` (s), and of the areas' states."""
+        standing = people.standing
+        for area, polygon in self._areas.items():
+            blocked = states.get(area) == "blocked"
+            there = {
+                who: (float(x), float(y))
+                for who, (x, y) in enumerate(people.places)
+                if distance_to_polygon(polygon, float(x), float(y)) <= BODY_M
+            }
+            for who, at in there.items():
+                seen = any(distance_to_polygon(cone, *at) <= BODY_M for cone in self._cones[area])
+                if standing[who] and contains_point(polygon, *at):
+                    self._standing.setdefault((area, who), _Stay(now, now)).until = now
+                    self._standing[area, who].seen |= seen
+                elif seen and not standing[who]:
+                    self._passing.setdefault((area, who), _Stay(now, now)).until = now
+            if blocked:
+                block = self._blocks.setdefault(area, _Block(now, occupied=False, stood=False))
+                block.occupied |= bool(there)
+                block.stood |= any(standing[who] for who in there)
+                for stays in (self._standing, self._passing):
+                    for (where, _), stay in stays.items():
+                        stay.reported |= where == area
+            elif area in self._blocks:
+                self._end_block(area, now)
+        self._end_stays(now)
+
+    def end(self, now: float) -> Episodes:
+        """Return what was found, with what lasts until now."""
+        for area in list(self._blocks):
+            self._end_block(area, now)
+        self._end_stays(math.inf)
+        self._found.passing_s = round(self._found.passing_s, 2)
+        return self._found
+
+    def _end_block(self, area: str, now: float) -> None:
+        block = self._blocks.pop(area)
+        self._found.blocks += 1
+        if not block.stood:
+            self._found.passing += block.occupied
+            self._found.empty += not block.occupied
+            self._found.passing_s += now - block.since
+
+    def _end_stays(self, now: float) -> None:
+        """Count those who went away; a node may report them for `_REPORTED_S` more."""
+        found = self._found
+        for key in [key for key, stay in self._standing.items() if now - stay.until > _REPORTED_S]:
+            stay = self._standing.pop(key)
+            if stay.until - stay.since >= MISSED_S:
+                found.stood += 1
+                found.missed += not stay.reported
+                found.stood_seen += stay.seen
+                found.missed_seen += stay.seen and not stay.reported
+        for key in [key for key, stay in self._passing.items() if now - stay.until > _REPORTED_S]:
+            found.passed += 1
+            found.passed_reported += self._passing.pop(key).reported
+
+
+def people_drives(
+    site: LoadedSite, asked: Sequence[PeopleTask], files: DriveFiles[PeopleDrive], jobs: int, commit: str = ""
+) -> Iterator[PeopleDrive]:
+    """Run the drives that have no record yet, so many at a time, and yield each record once it is written.
+
+    `commit` is only recorded.
+    """
+    due = [task for task in asked if not files.has(task.name)]
+    for drive in results(partial(people_drive, site, commit), due, jobs):
+        files.write(drive)
+        yield drive
+
+
+def people_drive(site: LoadedSite, commit: str, task: PeopleTask) -> PeopleDrive:
+    """Drive one task in lockstep; the same whenever it is repeated."""
+    drawn = task.drawn
+    run = ready(
+        site,
+        start_of(site, drawn),
+        ends_of(site, drawn)[1],
+        drawn.seed,
+        watched=task.setup not in ALONE,
+        profile=PROFILE_OF_SETUP[task.setup],
+    )
+    drive = run.drive
+    assert drive is not None
+    outcome = None if run.problem is None else DriveOutcome("stopped", run.problem)
+    among = _Among(site, run, task)
+    while outcome is None:
+        among.step()
+        outcome = drive.outcome(run.now)
+    result = run.result(drive, outcome)
+    release_drives()
+    told_by_drive = (
+        "reason", "success", "outcome", "distance_m", "time_s", "contacts", "min_clearance_m", "paths", "route_areas",
+        "modes", "stops", "operator_commands",
+    )  # fmt: skip
+    return PeopleDrive(
+        **{name: getattr(result, name) for name in told_by_drive},
+        setup=task.setup,
+        run=drawn.run,
+        route=drawn.route.name,
+        seed=drawn.seed,
+        area="",
+        people=task.people,
+        closest_m=_finite(among.closest_m),
+        closest_moving_m=_finite(among.closest_moving_m),
+        stood_s=round(among.stood_s, 2),
+        modes_s={mode: round(count * STEP_S, 2) for mode, count in sorted(among.modes.items())},
+        egresses=among.egresses,
+        episodes=among.observer.end(run.now),
+        commit=commit,
+        version=version("fognav-experiments"),
+    )
+
+
+class _Among:
+    """A drive among people, step by step."""
+
+    def __init__(self, site: LoadedSite, run: LockstepDrive, task: PeopleTask) -> None:
+        x, y, _ = run.world.pose
+        self.people = People(site.map, task.people, task.drawn.seed, (x, y))
+        self.people.begin(run.world)
+        self.observer = _Observer(site)
+        self.closest_m = self.closest_moving_m = math.inf
+        self.stood_s = 0.0
+        self.modes: Counter[str] = Counter()
+        self.egresses = 0
+        self._run = run
+        self._steps = 0
+        self._shut_in_since: float | None = None
+        self._distance_m = run.world.distance
+
+    def step(self) -> None:
+        """Simulate 10 ms."""
+        run = self._run
+        if self._steps % round(PEOPLE_S / STEP_S) == 0:
+            self.people.walk(run.world)
+        run.step()
+        self.modes[run.robot.agent.safety.mode] += 1
+        self._steps += 1
+        if self._steps % _OBSERVED_STEPS == 0:
+            self._observe()
+
+    def _observe(self) -> None:
+        run, world = self._run, self._run.world
+        moved, self._distance_m = world.distance - self._distance_m, world.distance
+        moves = moved > _MOVES_M_S * _OBSERVED_STEPS * STEP_S
+        self.stood_s += 0.0 if moves else _OBSERVED_STEPS * STEP_S
+        if len(self.people.places):
+            away = np.hypot(*(self.people.places - world.pose[:2]).T).min() - world.robot.radius - BODY_M
+            self.closest_m = min(self.closest_m, float(away))
+            if moves:
+                self.closest_moving_m = min(self.closest_moving_m, float(away))
+        self.observer.observe(run.now, self.people, run.hazards)
+        self._let_out()
+
+    def _let_out(self) -> None:
+        """Let the operator, who sees that people are gone, lead a robot out of a blocked area that it is shut in."""
+        run = self._run
+        state = run.state
+        if state is None or state.mode != "PROTECTIVE_STOP" or ReasonCode.IN_BLOCKED not in state.codes:
+            self._shut_in_since = None
+        elif self._shut_in_since is None:
+            self._shut_in_since = run.now
+        elif run.now - self._shut_in_since > EGRESS_S:
+            self._shut_in_since = None
+            if run.robot.command("egress").accepted:
+                self.egresses += 1
+                run.log_event("operator: egress")
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None
+
+
+ARCHIVE: Final = "people.jsonl.xz"
+_WORDS: Final = """\
+A robot drives from A to B among people, who walk by the social-force model of Helbing and Molnár \
+(*Physical Review E* 51, 4282, 1995) with its parameters: {speed} ± {spread} m/s (at most 1.3 times as fast as \
+somebody likes), relaxation 0.5 s, others 2.1 m²/s² and 0.3 m, walls 10 m²/s² and 0.2 m, 200° of sight and half of \
+that weight behind. Others are thought to be ahead by 1 s, in which open implementations of the paper differ. The \
+rest is our own: people go from anywhere on the floor to anywhere, stand there for {stands:g} s on average, and give \
+way to nobody then; who walks makes room for the robot as for a person, and comes no nearer than {near} m by himself. \
+They are round, 0.4 m wide, and echo as the simulator's boxes do. Each run draws others, the same in both setups. \
+`fog` is led by the fog; `lean`, the control, drives on its own at the same rates. In `fog` the planner has seen no \
+block before, so that it sends the robot round. After {egress:g} s in an area that became blocked round the robot an \
+operator lets it out (*let out*)."""
+_OF_NODES: Final = """\
+*By passers-by*: blocks during which nobody stood in the area. *Missed*: who stood in a watched area for more than \
+{missed:g} s while it was never blocked; in brackets those of them who stood in a cone. *More* is against the same \
+drive without people. *Stops* are protective stops, *holds* those on the way. *Closest* is the least distance between \
+the robot's rim and a person in a drive while the robot moved: median, least and most."""
+_HEADER: Final = (
+    "people", "setup", "drives, arrived", "m more", "s more", "s stood", "stops", "holds", "let out", "closest, m",
+    "contacts", "blocks", "by passers-by", "stood in areas", "missed (in cones)",
+)  # fmt: skip
+
+
+def publish(drives: Sequence[PeopleDrive], command: str, measured_on: Mapping[str, Any], target: Path) -> list[Path]:
+    """Write page, figure and archive of all records into a folder; return the files."""
+    counts = sorted({drive.people for drive in drives})
+    mean, spread_m_s = SPEED_M_S
+    words = _WORDS.format(speed=mean, spread=spread_m_s, stands=STANDS_S, near=FROM_ROBOT_M, egress=EGRESS_S)
+    seconds: dict[str, list[Estimate | None]] = {
+        setup: [_seconds(_cell(drives, count, setup)) for count in counts] for setup in SETUPS
+    }
+    shown = [found for line in seconds.values() for found in line]
+    picture = Picture(
+        "seconds.svg",
+        bars("A drive among people", "s", [str(count) for count in counts], seconds),
+        captioned("Seconds that a drive takes, by how many people are on the floor", shown),
+    )
+    blocks: list[Block] = [
+        Heading("People in beams and paths", 1),
+        Paragraph(words),
+        Code(command),
+        picture,
+        Table(_HEADER, [row for count in counts for setup in SETUPS if (row := _row(drives, count, setup))]),
+        Paragraph(_OF_NODES.format(missed=MISSED_S)),
+    ]
+    if failed := [[drive.name, drive.outcome, drive.reason] for drive in drives if not drive.success]:
+        blocks += [Paragraph("Drives that failed, and count in no mean:"), Table(["drive", "outcome", "why"], failed)]
+    commits = Counter(drive.commit for drive in drives)
+    blocks.append(Paragraph(f"Drives by commit: {', '.join(f'{n} at {commit}' for commit, n in commits.items())}."))
+    blocks.append(Table(["measured on", ""], [[name, str(value)] for name, value in flat(measured_on)]))
+    lines = [msgspec.json.encode({"measured_on": measured_on}), *map(msgspec.json.encode, drives)]
+    packed = lzma.compress(b"\n".join(lines) + b"\n", check=lzma.CHECK_SHA256, preset=9 | lzma.PRESET_EXTREME)
+    files = {"README.md": to_markdown(blocks).encode(), picture.file: picture.svg.encode(), ARCHIVE: packed}
+    for name, content in files.items():
+        atomic_write(target / name, content, mode=SHARED)
+    return [target / name for name in files]
+
+
+def _cell(drives: Sequence[PeopleDrive], count: int, setup: Setup) -> list[PeopleDrive]:
+    return [drive for drive in drives if (drive.people, drive.setup) == (count, setup)]
+
+
+def _seconds(cell: Sequence[PeopleDrive]) -> Estimate | None:
+    took = [(drive.time_s, drive.run) for drive in cell if drive.success and drive.time_s is not None]
+    return clustered([time_s for time_s, _ in took], [run for _, run in took]) if took else None
+
+
+def _row(drives: Sequence[PeopleDrive], count: int, setup: Setup) -> list[str]:
+    """Return a row of the table; none without a drive."""
+    cell = _cell(drives, count, setup)
+    if not cell:
+        return []
+    free = {drive.run: drive for drive in _cell(drives, 0, setup) if drive.success}
+    pairs = [(drive, free[drive.run]) for drive in cell if drive.success and drive.run in free]
+    runs = [drive.run for drive, _ in pairs]
+    metres = [drive.distance_m - empty.distance_m for drive, empty in pairs]
+    seconds = [(drive.time_s or 0.0) - (empty.time_s or 0.0) for drive, empty in pairs]
+    more = [told(values, runs) if count and pairs else "-" for values in (metres, seconds)]
+    closest = [drive.closest_moving_m for drive in cell if drive.closest_moving_m is not None]
+    of = [drive.episodes for drive in cell]
+    nodes = [
+        str(sum(each.blocks for each in of)),
+        str(sum(each.passing + each.empty for each in of)),
+        str(sum(each.stood for each in of)),
+        f"{sum(each.missed for each in of)} ({sum(each.missed_seen for each in of)})",
+    ]
+    return [
+        str(count), setup, f"{len(cell)}, {sum(drive.success for drive in cell)}", *more,
+        f"{np.mean([drive.stood_s for drive in cell]):.1f}",
+        str(sum(drive.modes.get("PROTECTIVE_STOP", 0) for drive in cell)),
+        str(sum(drive.modes.get("HOLD", 0) for drive in cell)),
+        str(sum(drive.egresses for drive in cell)),
+        spread(closest) if closest else "-",
+        str(sum(drive.contacts for drive in cell)),
+        *(nodes if setup not in ALONE else ["-"] * len(nodes)),
+    ]  # fmt: skip

@@ -14,7 +14,8 @@ from fog_runtime.configuration.site import load_site
 from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav.__main__ import app
-from fognav_experiments.bench import air, common, cores, fleet, fleet_live, pipeline, planner, rest
+from fognav.programs import SERVERS, SERVICES
+from fognav_experiments.bench import air, common, cores, fleet, fleet_live, floors, pipeline, planner, rest
 from fognav_experiments.bench import console as console_events
 from fognav_experiments.bench import floor as floor_bench
 from fognav_experiments.bench.common import make_office
@@ -225,6 +226,27 @@ async def test_no_reading_of_a_small_load_is_lost_and_hazards_reach_the_map(tmp_
     assert 0 < figures["confirmed_to_delta_p50_ms"] <= figures["confirmed_to_delta_p99_ms"]
     assert figures["confirmed_to_delta_p50_ms"] < figures["reading_to_delta_p50_ms"]
     assert figures["aggregator_us_per_reading"] > 0
+
+
+@pytest.mark.live
+@pytest.mark.timeout(300)
+async def test_robots_that_are_played_on_a_floor_drive_and_each_of_its_programs_is_counted(tmp_path: Path) -> None:
+    found = await floors.measure(tmp_path, [1], floors.Traffic(2, 3, settle_s=5.0), 5.0, lambda _: None)
+    (one,) = found["counts"]
+    assert one["driven_m"] > 0.3
+    assert one["memory_mb"].keys() == one["cpu_percent"].keys() == {*SERVERS, *SERVICES}
+    assert min(one["memory_mb"].values()) > 1.0
+
+
+def test_model_of_floors_says_how_far_it_is_off_between_its_ends() -> None:
+    counts = [
+        {"floors": n, "memory_mb": {"a": mb, "b": 10.0}, "cpu_percent": {"a": 5.0 * n}}
+        for n, mb in ((1, 90.0), (2, 180.0), (5, 490.0))
+    ]
+    assert floors.model(counts) == {
+        "memory_mb": {"fixed": 0.0, "each_floor": 100.0, "error_percent": {"2": 5.3}},
+        "cpu_percent": {"fixed": 0.0, "each_floor": 5.0, "error_percent": {"2": 0.0}},
+    }
 
 
 def test_frames_and_bytes_of_a_connection_are_what_went_over_it():

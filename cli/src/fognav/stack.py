@@ -185,10 +185,14 @@ class Stack:
         """Start broker, store and router; whoever subscribes now receives every message. Raises `NotReadyError`."""
         await self._start(SERVERS, SERVERS, timeout_s)
 
+    async def start_services(self, timeout_s: float = 90.0) -> None:
+        """Start the services alone, after the servers; raises `NotReadyError`."""
+        await self._start(SERVICES, SERVICES, timeout_s)
+
     async def start_system(self, timeout_s: float = 90.0) -> None:
         """Start all other processes, after the servers; raises `NotReadyError`."""
         # The services must be ready before nodes and robots publish, so that no message is missed.
-        await self._start(SERVICES, SERVICES, timeout_s)
+        await self.start_services(timeout_s)
         # The simulator provides the robot's serial ports, so it starts before the robot.
         await self._start([SIMULATOR], [SIMULATOR], timeout_s)
         await self._start(ROBOT, [WATCHDOG], timeout_s)

@@ -214,7 +214,7 @@ class BlindRobot:
 
     def pose(self, stamp: float) -> RobotPose:
         """Return the pose that it tells."""
-        wrong = self.rng.uniform(-OFF_PATH_M, OFF_PATH_M, 2) / 2.0
+        wrong = (self.rng.uniform(-OFF_PATH_M, OFF_PATH_M, 2) / 2.0).tolist()
         return RobotPose(
             x=self.x + wrong[0], y=self.y + wrong[1], theta=self.theta, covariance=[0.0] * 9, v=0.0, w=0.0,
             radius=RADIUS_M, height=0.1, stamp=stamp,

@@ -111,6 +111,32 @@ def floor_command(
     _show("floor", asked, figures, json=json)
 
 
+@bench_app.command("floors", epilog="Example: fognav bench floors --floors 1 --floors 2 --floors 5 --json")
+def floors_command(
+    *,
+    counts: Annotated[
+        list[int], typer.Option("--floors", metavar="N", min=1, max=50, help="How many; may be repeated.")
+    ],
+    robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=20, help="Of each floor.")] = 5,
+    nodes: Annotated[int, typer.Option("--nodes", metavar="N", min=1, max=200, help="Of each floor.")] = 25,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=5.0, help="How long to measure.")] = 60.0,
+    json: JsonOption = False,
+) -> None:
+    """Measure what floors cost this machine, each with servers and services of its own.
+
+    Robots and nodes are played by one process a floor, which does not count. Memory (MB) and processor time (% of a
+    core) are those of all floors together, by program; the model is the line through the least and the largest count.
+    """
+    from fognav_experiments.bench import floors  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(print_line)
+    with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
+        traffic = floors.Traffic(robots, nodes)
+        figures = asyncio.run(floors.measure(Path(folder), counts, traffic, seconds, print_line))
+    asked = {"robots": robots, "nodes": nodes, "seconds": seconds}
+    _show("floors", asked, figures, json=json)
+
+
 @bench_app.command("room", epilog="Example: fognav bench room --robots 10 --seeds 200 --floor estig --json")
 def room_command(  # noqa: PLR0913  # its options
     *,

@@ -96,7 +96,7 @@ def test_each_console_lists_the_other_floors_with_a_token_that_is_valid_there(ou
     for here, there in (FLOORS, FLOORS[::-1]):
         folder = out / here / "secrets" / "console-service"
         (peer,) = read_peers(folder / "floors.toml", here)
-        assert (peer.id, peer.address) == (there, f"https://{there}.local")
+        assert (peer.id, peer.addresses) == (there, (f"https://{there}.local",))
         tokens = {each.sha256: each for each in read_tokens(out / there / "secrets" / "planner" / "tokens.toml")}
         assert tokens[token_hash(peer.token)].role == "viewer"
         environment = made(out, here)["services"]["console-service"]["environment"]

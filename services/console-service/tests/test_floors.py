@@ -8,12 +8,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import httpx
+import msgspec
 import pytest
 from msgspec.structs import replace
 from starlette.requests import Request
 
 from console_service.core import ConsoleCore
-from console_service.floors import AWAY_S, OwnFloor, read_peers
+from console_service.floors import AWAY_S, FloorStop, FloorView, Hub, OwnFloor, Peer, read_peers
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import CommandReply, Pose, RobotGoal, RobotPath, RobotRelease, RobotState
@@ -235,6 +236,42 @@ async def test_stop_is_acknowledged_only_by_who_knows_all_robots_and_known_ones_
     assert not remedy or "press again" in stop.detail
 
 
+@pytest.mark.parametrize("dead", [0, 1])
+async def test_floor_with_two_machines_is_seen_and_stopped_at_once_though_one_of_them_is_dead(dead):
+    view = FloorView(site="up", not_ready={}, robots=[], blocked=[], unknown=[], stopped=False)
+
+    async def answer(reader, writer):
+        asked = (await reader.readuntil(b"\r\n\r\n")).split()[0]
+        said = view if asked == b"GET" else FloorStop(id="up", acknowledged=True, robots=[])
+        body = msgspec.json.encode(said)
+        writer.write(b"HTTP/1.1 200 OK\r\nConnection: close\r\nContent-Length: %d\r\n\r\n" % len(body) + body)
+        writer.close()
+
+    async def say_nothing(reader, writer):
+        await reader.read()
+        writer.close()
+
+    async with AsyncExitStack() as stack:
+        addresses = []
+        for number in (0, 1):
+            server = await asyncio.start_server(say_nothing if number == dead else answer, "127.0.0.1")
+            await stack.enter_async_context(server)
+            addresses.append(f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+        hub = Hub([Peer("up", tuple(addresses), "secret", None)], SystemClock())
+        running = asyncio.create_task(hub.run())
+        stack.callback(running.cancel)
+        begun = time.monotonic()
+        assert (await hub.stop("up", "anna")).acknowledged
+        assert time.monotonic() - begun < 1.0
+        async with asyncio.timeout(10.0):
+            while True:
+                if hub.entries()[0].reachable:
+                    break
+                await asyncio.sleep(0.05)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+
 @pytest.mark.parametrize("mode", ["EGRESS", "DOCK", "TELEOP"])
 async def test_floor_is_not_stopped_while_a_robot_moves_that_is_not_enabled(mode):
     core = ConsoleCore("lab", "r", robots=[])
@@ -305,6 +342,6 @@ def test_all_machines_may_have_the_same_list_and_each_leaves_itself_out(tmp_path
     (tmp_path / "own.toml").write_text('user = "campus"\ntoken = "secret"')
     entry = 'address = "https://{0}.local:8004/"\ncredentials = "own.toml"\n'
     (tmp_path / "floors.toml").write_text("".join(f"[floors.{each}]\n{entry.format(each)}" for each in ("up", "here")))
-    assert [(peer.id, peer.address) for peer in read_peers(tmp_path / "floors.toml", "here")] == [
-        ("up", "https://up.local:8004")
+    assert [(peer.id, peer.addresses) for peer in read_peers(tmp_path / "floors.toml", "here")] == [
+        ("up", ("https://up.local:8004",))
     ]

@@ -146,6 +146,8 @@ def _peers(floor: FloorAt, floors: Sequence[FloorAt], securities: Mapping[str, S
         text = to_toml(name, authority=security.authority.trusted, passwords={}, token=token.read_text("ascii").strip())
         found[f"{other.id}.toml"] = text.encode()
         listed += f'[floors.{other.id}]\naddress = "https://{other.hosts[0]}"\ncredentials = "{other.id}.toml"\n'
+        if other.twice:
+            listed += f'second_address = "https://{other.hosts[1]}"\n'
     return found | {_FLOORS: listed.encode()} if found else {}
 
 

@@ -11,7 +11,8 @@ import asyncio
 import re
 import time
 import tomllib
-from contextlib import aclosing
+from collections import deque
+from contextlib import AsyncExitStack, aclosing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeVar
 from urllib.parse import urlsplit
@@ -123,17 +124,24 @@ class FloorEntry(Message, frozen=True, kw_only=True):
 
 
 class Peer(NamedTuple):
-    """A floor on another machine: where its console-service serves REST, with which token, and whom to trust there."""
+    """A floor on another machine: where its console-service serves REST, with which token, and whom to trust there.
+
+    One that has two copies has two addresses.
+    """
 
     id: str
-    address: str
+    addresses: tuple[str, ...]
     token: str
     tls: ssl.SSLContext | None
 
 
+_Address = Annotated[str, msgspec.Meta(pattern=r"^https?://[^/?#]+/?$(?!\n)")]
+
+
 class _Listed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    address: Annotated[str, msgspec.Meta(pattern=r"^https?://[^/?#]+/?$(?!\n)")]
+    address: _Address
     credentials: str
+    second_address: _Address | None = None
 
 
 class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -166,17 +174,21 @@ def _peer(file: Path, floor: str, entry: _Listed) -> Peer:
             f"{file}: the credentials of {floor} have no token: make them there by `fognav token create NAME --role "
             "viewer --out FILE`"
         )
-    parts = urlsplit(entry.address)
-    try:
-        _ = parts.port
-    except ValueError as error:
-        raise SettingsError(f"{file}: the address of {floor}, {entry.address}: {error}. Correct its port") from error
-    if parts.scheme != "https" and parts.hostname not in _LOOPBACK:
-        raise SettingsError(
-            f"{file}: {entry.address} is not encrypted, so everybody in the network could read the token of {floor}. "
-            "Begin it with https://"
-        )
-    return Peer(floor, entry.address.rstrip("/"), own.token, own.tls_context() if parts.scheme == "https" else None)
+    addresses = (entry.address, *([entry.second_address] if entry.second_address else []))
+    for address in addresses:
+        parts = urlsplit(address)
+        try:
+            _ = parts.port
+        except ValueError as error:
+            raise SettingsError(f"{file}: the address of {floor}, {address}: {error}. Correct its port") from error
+        if parts.scheme != "https" and parts.hostname not in _LOOPBACK:
+            raise SettingsError(
+                f"{file}: {address} is not encrypted, so everybody in the network could read the token of {floor}. "
+                "Begin it with https://"
+            )
+    encrypted = any(address.startswith("https:") for address in addresses)
+    trusted = own.tls_context() if encrypted else None
+    return Peer(floor, tuple(address.rstrip("/") for address in addresses), own.token, trusted)
 
 
 class OwnFloor:
@@ -303,9 +315,9 @@ class _AskError(Exception):
         self.trouble: Trouble = trouble
 
 
-def _client(peer: Peer, patience: httpx.Timeout) -> httpx.AsyncClient:
+def _client(peer: Peer, address: str, patience: httpx.Timeout) -> httpx.AsyncClient:
     return httpx.AsyncClient(
-        base_url=peer.address, headers={"Authorization": f"Bearer {peer.token}"}, timeout=patience, trust_env=False,
+        base_url=address, headers={"Authorization": f"Bearer {peer.token}"}, timeout=patience, trust_env=False,
         verify=True if peer.tls is None else peer.tls,
     )  # fmt: skip
 
@@ -341,7 +353,7 @@ def _of(peer: Peer, view: FloorView) -> FloorView:
     if view.site == peer.id:
         return view
     raise _AskError(
-        "other_floor", f"{peer.address} is the floor {view.site}, not {peer.id}: correct the list of floors"
+        "other_floor", f"{peer.addresses[0]} is the floor {view.site}, not {peer.id}: correct the list of floors"
     )
 
 
@@ -376,9 +388,14 @@ class Hub:
                 tasks.create_task(self._follow(peer), name=f"floor {peer.id}")
 
     async def _follow(self, peer: Peer) -> None:
-        async with _client(peer, _ASK) as client:
+        async with AsyncExitStack() as contexts:
+            clients = deque(
+                [await contexts.enter_async_context(_client(peer, address, _ASK)) for address in peer.addresses]
+            )
             async for now in ticker(self._clock, PERIOD_S):
-                await self._look(peer, client, now)
+                await self._look(peer, clients[0], now)
+                if self._known[peer.id].trouble == "silent":
+                    clients.rotate()
 
     async def _look(self, peer: Peer, client: httpx.AsyncClient, now: float) -> None:
         """Ask a floor how it is, at `now`."""
@@ -406,7 +423,7 @@ class Hub:
             found.append(
                 FloorEntry(
                     id=floor,
-                    address=self._peers[floor].address,
+                    address=self._peers[floor].addresses[0],
                     reachable=not known.trouble and not late,
                     age_s=age,
                     heard=known.heard,
@@ -420,11 +437,27 @@ class Hub:
     async def stop(self, floor: str, who: str) -> FloorStop:
         """Stop a floor on another machine, now and once; what does not succeed is in the answer.
 
-        The floor's audit trail names `who`, as part of whose token this one has.
+        The floor's audit trail names `who`, as part of whose token this one has. A floor with two addresses is asked at
+        both: its copies lead to the same robots, and one may be dead.
         """
+        peer, first = self._peers[floor], None
+        asked = [asyncio.create_task(self._stop_at(peer, address, who)) for address in peer.addresses]
+        try:
+            for answered in asyncio.as_completed(asked):
+                answer = await answered
+                if answer.acknowledged:
+                    return answer
+                first = max(first or answer, answer, key=lambda each: len(each.robots))
+        finally:
+            for task in asked:
+                task.cancel()
+        assert first is not None, "a floor has an address"
+        return first
+
+    async def _stop_at(self, peer: Peer, address: str, who: str) -> FloorStop:
         try:
             # Not by a connection that waits since the last question: it may be dead, and nobody has noticed.
-            async with _client(self._peers[floor], _STOP) as client:
+            async with _client(peer, address, _STOP) as client:
                 client.headers[PART] = re.sub(r"[^a-z0-9-]", "-", who.lower())[:32]
                 async with asyncio.timeout(_STOPPED_S):
                     return await _ask(client, "POST", f"{HERE}/stop", FloorStop)
@@ -433,4 +466,4 @@ class Hub:
                 f"{str(error) or 'its answer does not end'}. Its robots may go on driving: press again, use that "
                 "floor's own console, or stop them on the spot. Nothing is sent again by itself"
             )
-            return FloorStop(id=floor, acknowledged=False, robots=[], detail=detail)
+            return FloorStop(id=peer.id, acknowledged=False, robots=[], detail=detail)

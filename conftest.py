@@ -154,6 +154,18 @@ def belongs(item: pytest.Item, tier: str) -> bool:
     return not long and (tier == "all" or is_quick(item) == (tier == "quick"))
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no module of which the tier runs no test, unless it is named: each worker imports what it collects."""
+    tier = config.getoption("tier", "all")
+    named = {config.invocation_params.dir / argument.partition("::")[0] for argument in config.args}
+    if tier in {"all", "long"} or not collection_path.match("test_*.py") or collection_path in named:
+        return None
+    text = collection_path.read_text("utf-8")
+    computes_only = group_of(str(collection_path.relative_to(ROOT)))[0] == COMPUTING
+    some = computes_only or "mark.smoke" in text if tier == "quick" else not computes_only or "mark.drive" in text
+    return None if some else True
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out what another tier runs, and start with the tests that take longest, if several workers share them.
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from robot_agent.localization.fit import Fit, confirms, evaluate_fit, shows_place, tells_place
 from robot_agent.localization.pose import Pose2, wrap
-from robot_agent.localization.scans import match_scan
+from robot_agent.localization.scans import information_of, matched_pose
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -42,7 +42,7 @@ _NEWS_M: Final = 0.2
 _NEWS_RAD: Final = 0.2
 """Scans count as independent when the robot has moved this far between them."""
 _PLACES_MAX: Final = 48
-_MATCH_COVARIANCE: Final = np.diag(np.square((0.2, 0.2, 0.1)))
+_MATCHED: Final = information_of(np.diag(np.square((0.2, 0.2, 0.1))))
 _BEAMS: Final = 180
 _FOLLOWED_M: Final = 2.0
 """A pose that was good for so long a way is kept against places that explain the scans better, while each scan shows
@@ -160,7 +160,7 @@ def apart(pose: Pose2, other: Pose2) -> bool:
 def weighed(place: Hypothesis, pose: Pose2, scan: DeskewedScan, fields: MapFields, range_max: float) -> Hypothesis:
     """Return a place weighed by one scan more, at which the robot was at about `pose`; it is matched to the scan."""
     points = scan.beams(_BEAMS)
-    matched = match_scan(fields, pose, _MATCH_COVARIANCE, points).pose
+    matched = matched_pose(fields, pose, _MATCHED, points)
     fit = evaluate_fit(fields, matched, points, range_max)
     score = float(fields.agreements(np.array([matched]), points, fields.fine)[0])
     log_quality = place.log_quality + math.log(max(quality(score, fit), 1e-3))

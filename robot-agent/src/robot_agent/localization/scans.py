@@ -130,9 +130,21 @@ class Match(NamedTuple):
 
 def match_scan(fields: MapFields, pose: Pose2, covariance: NDArray[np.float64], points: NDArray[np.float64]) -> Match:
     """Refine an estimate with its covariance (3, 3) by a scan's points (n, 2; m, frame `base`)."""
-    prior = covariance + np.diag(np.square(_LEAST_SIGMAS))
-    information = np.linalg.inv(prior)
+    information = information_of(covariance)
+    matched = matched_pose(fields, pose, information, points)
+    fit = fields.scores(np.array(matched) + _SHIFTS * _CURVATURE_STEP, points, fields.sharp)
+    return Match(matched, _posterior_covariance(_INFORMATION * fit, information))
 
+
+def information_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the information (3, 3) of a prior with this covariance over (x, y, theta), of which none is exact."""
+    return np.linalg.inv(covariance + np.diag(np.square(_LEAST_SIGMAS)))
+
+
+def matched_pose(
+    fields: MapFields, pose: Pose2, information: NDArray[np.float64], points: NDArray[np.float64]
+) -> Pose2:
+    """Return the pose of `match_scan` alone, which takes a third of the time; information: (3, 3) of the estimate."""
     g = fields.geometry
     best = climb(
         points,
@@ -147,9 +159,7 @@ def match_scan(fields: MapFields, pose: Pose2, covariance: NDArray[np.float64], 
         _CLIMBS_MAX,
     )
     x, y, theta = (float(value) for value in np.array(pose) + best)
-    matched = Pose2(x, y, wrap(theta))
-    fit = fields.scores(np.array(matched) + _SHIFTS * _CURVATURE_STEP, points, fields.sharp)
-    return Match(matched, _posterior_covariance(_INFORMATION * fit, information))
+    return Pose2(x, y, wrap(theta))
 
 
 def _posterior_covariance(values: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import programs
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -55,7 +56,7 @@ REACTION, COMPUTING, SYSTEM, LIVE, COMPOSE = range(5)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Give each worker its own range of ports, and the programs that it starts the usual signals.
+    """Give each worker its own range of ports and the run's programs, and what it starts the usual signals.
 
     Two workers that search for a port at the same moment would find the same one.
     """
@@ -64,6 +65,8 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.signal(signal.SIGHUP, lambda *_: None)
     if config.getoption("tier", "all") == "long":
         config.stash[COMMIT] = commit()
+    if hasattr(config, "workerinput"):
+        programs.RUN = os.getppid()
     share = len(net.PORTS) // WORKERS
     net.PORTS = net.PORTS[int(WORKER) * share : (int(WORKER) + 1) * share]
 

@@ -1,16 +1,18 @@
 """Starts `python -m MODULE` for tests without its imports: forked from a process that has done them already.
 
-Importing a service costs one to three seconds of a core, more than most tests need afterwards. So each pytest process
-keeps one parent for each program, which imports what the program imports, and forks when a test starts it. The program
-is a process like any other, with its own environment, files and signals, and runs its module as `__main__`. What is
-true of a start alone, such as that no kernel is compiled, is tested with `python -m`. `run` does the same for commands
-of `fognav`, of which the live tests type a hundred.
+Importing a service costs one to three seconds of a core, more than most tests need afterwards. So a run of the tests
+keeps one parent for each program, which imports what the program imports, and forks when a test starts it. All workers
+share it: whoever needs it first starts it, and it ends with the run. The program is a process like any other, with its
+own environment, files and signals, and runs its module as `__main__`. What is true of a start alone, such as that no
+kernel is compiled, is tested with `python -m`. `run` does the same for commands of `fognav`, of which the live tests
+type a hundred.
 """
 
 from __future__ import annotations
 
-import atexit
 import contextlib
+import errno
+import fcntl
 import gc
 import importlib
 import json
@@ -30,6 +32,8 @@ from typing import IO, TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+RUN = os.getpid()
+"""The process that runs the tests, or lets its workers run them: then the root's conftest.py names it."""
 _MESSAGE_BYTES = 1 << 17
 _LOADED_BY_COMMANDS = {
     "fognav": ("fognav.commands.installed", "fognav.commands.status", "fognav.commands.zone", "fognav.commands.area",
@@ -84,7 +88,7 @@ def start(module: str, environment: Mapping[str, str], log: Path) -> Program:
     Raises ValueError for a variable that Python or numba would have read before the fork; PYTHONPATH is respected.
     """
     with log.open("ab") as file:
-        return _start({"module": module, "environment": dict(environment)}, file, file)
+        return _start({"module": module, "environment": dict(environment), "in": str(Path.cwd())}, file, file)
 
 
 def run(
@@ -124,42 +128,68 @@ def _read_at_import(environment: Mapping[str, str]) -> set[tuple[str, str]]:
 
 @cache
 def _parent(module: str) -> socket.socket:
-    """Return the link to the parent of this program, which ends with this process."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with theirs:
-        # A session of its own: Ctrl-C ends pytest, whose fixtures end the programs.
-        parent = subprocess.Popen(
-            [sys.executable, __file__, module, str(theirs.fileno())], pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL, start_new_session=True,
-        )  # fmt: skip
-    atexit.register(parent.wait)
-    atexit.register(ours.close)  # before the wait: it is what ends the parent
-    return ours
+    """Return this process's link to the parent of a program; what is started over it ends with this process."""
+    name = f"\0fognav-tests-{RUN}-{module}"
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with Path(__file__).open("rb") as lock, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # another worker connects to what listens already
+        try:
+            listener.bind(name)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+        else:
+            listener.listen()
+            # A session of its own: Ctrl-C ends pytest, whose fixtures end the programs.
+            command = [sys.executable, __file__, module, str(listener.fileno()), str(RUN)]
+            _started.append(
+                subprocess.Popen(
+                    command, pass_fds=[listener.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
+                )
+            )
+        link.connect(name)
+    return link
+
+
+_started: list[subprocess.Popen[bytes]] = []
+"""Parents that this process has started. They end after the run, which waits for none of them."""
 
 
 class _Parent:
-    """Forks the program for each request, and reports its process id and its end; children end with it."""
+    """Forks the program for each request, and reports its process id and its end; children end with who requested."""
 
-    def __init__(self, requests: socket.socket) -> None:
-        self._requests = requests
-        self._children: dict[int, tuple[int, socket.socket]] = {}  # by the descriptor that tells of its end
+    def __init__(self, listener: socket.socket, run: int) -> None:
+        self._listener = listener
+        self._run = os.pidfd_open(run)
+        self._children: dict[int, tuple[int, socket.socket, socket.socket]] = {}
+        """Process, where its end is reported, and who requested it, by the descriptor that tells of its end."""
         self._selector = selectors.DefaultSelector()
-        self._selector.register(requests, selectors.EVENT_READ)
+        self._selector.register(listener, selectors.EVENT_READ)
+        self._selector.register(self._run, selectors.EVENT_READ)
 
     def serve(self) -> dict[str, Any] | None:
-        """Return the request in each forked child, and None in the parent after the last one."""
+        """Return the request in each forked child, and None in the parent after the run."""
         while True:
             for key, _ in self._selector.select():
-                if key.fileobj is not self._requests:
+                if key.fd == self._run:
+                    return self._end(None)
+                if key.fd in self._children:
                     self._report_end(key.fd)
-                    continue
-                data, descriptors, _, _ = socket.recv_fds(self._requests, _MESSAGE_BYTES, 3)
-                if not data:
-                    return self._end()
-                if self._fork(*descriptors):
-                    return json.loads(data)
+                elif key.fileobj is self._listener:
+                    self._selector.register(self._listener.accept()[0], selectors.EVENT_READ)
+                elif request := self._request(key.fileobj):
+                    return request
 
-    def _fork(self, answers: int, output: int, errors: int) -> bool:
+    def _request(self, link: socket.socket) -> dict[str, Any] | None:
+        """Return what is requested in the forked child, and None in the parent."""
+        data, descriptors, _, _ = socket.recv_fds(link, _MESSAGE_BYTES, 3)
+        if data:
+            return json.loads(data) if self._fork(link, *descriptors) else None
+        self._selector.unregister(link)
+        link.close()
+        return self._end(link)
+
+    def _fork(self, requester: socket.socket, answers: int, output: int, errors: int) -> bool:
         """Return whether this is the child."""
         if pid := os.fork():
             os.close(output)
@@ -167,35 +197,38 @@ class _Parent:
             link = socket.socket(fileno=answers)
             link.send(str(pid).encode())
             ended = os.pidfd_open(pid)
-            self._children[ended] = pid, link
+            self._children[ended] = pid, link, requester
             self._selector.register(ended, selectors.EVENT_READ)
             return False
         os.dup2(output, 1)
         os.dup2(errors, 2)
-        for descriptor in (answers, output, errors, *self._children):
-            os.close(descriptor)
-        for _, link in self._children.values():
+        for _, link, _ in self._children.values():
             link.close()
+        for key in self._selector.get_map().values():
+            os.close(key.fd) if isinstance(key.fileobj, int) else key.fileobj.close()
         self._selector.close()
-        self._requests.close()
+        for descriptor in (answers, output, errors):
+            os.close(descriptor)
         return True
 
     def _report_end(self, ended: int) -> None:
-        pid, link = self._children.pop(ended)
+        pid, link, _ = self._children.pop(ended)
         self._selector.unregister(ended)
         os.close(ended)
         _, status = os.waitpid(pid, 0)
         with link, contextlib.suppress(BrokenPipeError):  # nobody waits for a program that has been forgotten
             link.send(str(status).encode())
 
-    def _end(self) -> None:
-        for pid, _ in self._children.values():
-            os.kill(pid, signal.SIGKILL)
+    def _end(self, requester: socket.socket | None) -> None:
+        """End all children, or those of a process that has ended."""
+        for pid, _, by in self._children.values():
+            if requester in (None, by):
+                os.kill(pid, signal.SIGKILL)
 
 
 def main() -> None:
     """Import what the module imports, then become the program in every forked child."""
-    module, descriptor = sys.argv[1:]
+    module, descriptor, run = sys.argv[1:]
     sys.path[0] = str(Path.cwd())  # as `python -m` has it
     name = module
     if importlib.util.find_spec(module).submodule_search_locations is not None:
@@ -206,7 +239,7 @@ def main() -> None:
     del sys.modules[name]  # it runs as __main__
     gc.collect()
     gc.freeze()  # shared with the children until one of them writes
-    request = _Parent(socket.socket(fileno=int(descriptor))).serve()
+    request = _Parent(socket.socket(fileno=int(descriptor)), int(run)).serve()
     if request is not None:
         environment = request["environment"]
         more = [part for part in environment.get("PYTHONPATH", "").split(os.pathsep) if part and part not in sys.path]
@@ -214,7 +247,7 @@ def main() -> None:
         os.environ.clear()
         os.environ.update(environment)
         sys.argv[:] = [file, *request.get("arguments", ())]
-        os.chdir(request.get("in", "."))
+        os.chdir(request["in"])
         time.tzset()
         runpy.run_module(module, run_name="__main__", alter_sys=True)
 

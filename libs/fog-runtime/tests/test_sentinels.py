@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import os
 import random
+import signal
 import sys
 from collections.abc import Callable
 from itertools import count
@@ -223,6 +224,18 @@ async def test_locked_replica_takes_over_from_a_primary_that_dies(secured_cluste
     assert await store_once(url, own) == [1]
     primary.kill()
     assert await store_once(url, own) == [0], "the other one has it"
+
+
+async def test_write_after_a_primary_fell_silent_goes_to_the_next_one_at_once(secured_cluster):
+    address, own, primary = secured_cluster
+    url = f"rediss+sentinel://{address}?wait=1"
+    await store_once(url, own)
+    connection = RedisConnection(url, credentials=own)
+    await asyncio.gather(*(connection.read("HGET", "fog:lab:zones", "z1") for _ in range(2)))  # two are connected
+    os.kill(primary.pid, signal.SIGSTOP)
+    await store_once(url, own)
+    assert await connection.write(("HSET", "fog:lab:zones", "z1", "{}")) == [0]
+    await connection.aclose()
 
 
 async def test_sentinels_of_another_authority_are_not_believed(secured_cluster, tmp_path):

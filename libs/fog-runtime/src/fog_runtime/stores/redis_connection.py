@@ -10,15 +10,17 @@ have it in memory (`WAIT`), so that it survives the loss of the primary.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+import contextlib
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from prometheus_client import Gauge
 from redis.asyncio import Redis
 from redis.asyncio.retry import Retry
-from redis.asyncio.sentinel import MasterNotFoundError, Sentinel
+from redis.asyncio.sentinel import MasterNotFoundError, Sentinel, SentinelManagedSSLConnection
 from redis.backoff import NoBackoff
 from redis.exceptions import BusyLoadingError, OutOfMemoryError, ReadOnlyError, RedisError
+from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 
 from fog_runtime.concurrency import raise_if_cancelled
@@ -26,9 +28,10 @@ from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.files import atomic_write
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
     from pathlib import Path
 
+_T = TypeVar("_T")
 Argument = str | bytes | int
 Command = tuple[Argument, ...]
 
@@ -113,38 +116,34 @@ class RedisConnection:
 
     async def aclose(self) -> None:
         """Close the connections."""
-        await self._client.aclose()
-        if self._sentinel is not None:
-            for client in self._sentinel.sentinels:
+        for client in (self._client, *(self._sentinel.sentinels if self._sentinel is not None else ())):
+            with contextlib.suppress(RedisTimeoutError):  # one that hangs says no goodbye, and is left all the same
                 await client.aclose()
 
     async def read(self, *command: Argument) -> Any:  # noqa: ANN401  # redis does not type its replies
         """Execute a command that changes nothing, and return its reply."""
-        try:
-            return await self._client.execute_command(*command)  # type: ignore[no-untyped-call]  # redis types it not
-        except (RedisError, OSError) as error:
-            raise_if_cancelled()
-            raise self._failure(error) from error
+        # redis does not type it
+        return await self._twice(lambda: self._client.execute_command(*command))  # type: ignore[no-untyped-call]
 
     async def write(self, *commands: Command) -> list[Any]:
         """Execute commands as one transaction and return their replies.
 
         With `wait` in the address it returns once that many replicas have the changes.
         """
-        pipeline: Any = self._client.pipeline(transaction=False)  # redis types a pipeline as Redis
         wait = self._address.replicas
         commands = commands if len(commands) == 1 else (("MULTI",), *commands, ("EXEC",))
-        for command in commands:
-            pipeline.execute_command(*command)
-        if wait:
-            # On the same connection: WAIT counts the replicas that have the connection's own last write.
-            pipeline.execute_command("WAIT", wait, max(1, int(900 * self._timeout_s)))
-        try:
+
+        async def execute() -> list[Any]:
+            pipeline: Any = self._client.pipeline(transaction=False)  # redis types a pipeline as Redis
+            for command in commands:
+                pipeline.execute_command(*command)
+            if wait:
+                # On the same connection: WAIT counts the replicas that have the connection's own last write.
+                pipeline.execute_command("WAIT", wait, max(1, int(900 * self._timeout_s)))
             # Not raised by the pipeline, which would put the whole command into the message.
-            replies: list[Any] = await pipeline.execute(raise_on_error=False)
-        except (RedisError, OSError) as error:
-            raise_if_cancelled()
-            raise self._failure(error) from error
+            return list(await pipeline.execute(raise_on_error=False))
+
+        replies = await self._twice(execute)
         raise_if_cancelled()
         if (failed := next((reply for reply in replies if isinstance(reply, Exception)), None)) is not None:
             raise self._failure(failed) from failed
@@ -154,6 +153,20 @@ class RedisConnection:
                 " start the replicas, or lower `wait` in FOGNAV_REDIS_URL"
             )
         return replies if len(commands) == 1 else list(replies[-1])
+
+    async def _twice(self, execute: Callable[[], Awaitable[_T]]) -> _T:
+        """Execute something, and once more if the connection failed.
+
+        The client's own second attempt goes to the address of the first one, though the primary is another one now.
+        """
+        try:
+            with contextlib.suppress(RedisConnectionError, RedisTimeoutError):
+                return await execute()
+            raise_if_cancelled()
+            return await execute()
+        except (RedisError, OSError) as error:
+            raise_if_cancelled()
+            raise self._failure(error) from error
 
     def _failure(self, error: Exception) -> StoreError:
         """Return an error that names the cause, and the remedy where there is one."""
@@ -173,6 +186,19 @@ def _code(error: Exception) -> str:
     code = next((code for kind, code in kinds.items() if isinstance(error, kind)), "")
     # What the client makes of READONLY when the Sentinels name another primary.
     return code or ("READONLY" if "now a slave" in str(error) else str(error).partition(" ")[0])
+
+
+class _PrimaryConnection(SentinelManagedSSLConnection):
+    """Is closed without the server's goodbye: a primary that was cut off says none.
+
+    The client closes all of its connections before the first one to another primary, and fails the command for which it
+    does so if one of them takes longer than the timeout.
+    """
+
+    async def disconnect(self, *reasons: Any, **named: Any) -> None:  # noqa: ANN401  # the client's
+        if self._writer is not None:
+            self._writer.transport.abort()
+        await super().disconnect(*reasons, **named)
 
 
 class _Sentinels(Sentinel):
@@ -217,7 +243,7 @@ def _connect(address: RedisAddress, timeout_s: float, credentials: Credentials) 
         "db": address.db,
         "username": address.username,
         "password": address.password,
-        "retry": Retry(NoBackoff(), 1),
+        "retry": Retry(NoBackoff(), 0),
     }
     tls: dict[str, Any] = {"ssl": True, "ssl_ca_data": credentials.authority or None} if address.tls else {}
     options |= tls
@@ -225,9 +251,10 @@ def _connect(address: RedisAddress, timeout_s: float, credentials: Credentials) 
         ((host, port),) = address.hosts
         return Redis(host=host, port=port, **options), None
     sentinels: Sequence[tuple[str, int]] = address.hosts
-    once = {**timeouts, **tls, "retry": Retry(NoBackoff(), 0)}
-    sentinel = _Sentinels(sentinels, sentinel_kwargs=once, **options)
-    return sentinel.master_for(address.sentinel_name), sentinel
+    kind: dict[str, Any] = {"connection_class": _PrimaryConnection} if address.tls else {}
+    own = {**timeouts, **tls, "retry": options["retry"]}
+    sentinel = _Sentinels(sentinels, sentinel_kwargs=own, **options)
+    return sentinel.master_for(address.sentinel_name, **kind), sentinel
 
 
 LOST: Final = Gauge(

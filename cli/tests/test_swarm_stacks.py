@@ -134,6 +134,16 @@ def test_floor_with_three_machines_runs_twice_and_redis_three_times(out: Path) -
     assert {f"{name}-2" for name in first} == {name for name, machine in machines.items() if machine == "2"}
 
 
+def test_files_of_the_machines_are_together_the_whole_stack(out: Path) -> None:
+    parts = {machine: made(out, f"{TWICE}.{machine}") for machine in "123"}
+    for kind, whole in made(out, TWICE).items():
+        together = (
+            {name: each for part in parts.values() for name, each in part[kind].items()} if kind != "version" else whole
+        )
+        assert together == whole
+    assert {machine_of(each) for each in parts["2"]["services"].values()} == {"2"}
+
+
 def names_in(networks: Any, name: str) -> dict[str, set[str]]:
     """Return by which names a service is known in each of its networks."""
     listed = networks if isinstance(networks, dict) else dict.fromkeys(networks)

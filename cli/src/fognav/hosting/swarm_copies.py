@@ -19,8 +19,8 @@ from fog_supervisor.configurations import SENTINEL_PORT, STORE, Peer
 _Part = dict[str, Any]
 
 MACHINES: Final = 3
-_SERVICES: Final = ("hazard-aggregator", "map-service", "planner", "console-service")
-_TWICE: Final = ("mosquitto", "mosquitto-relay", "zenoh", *_SERVICES, "gateway")
+SERVICES: Final = ("hazard-aggregator", "map-service", "planner", "console-service")
+_TWICE: Final = ("mosquitto", "mosquitto-relay", "zenoh", *SERVICES, "gateway")
 _REDIS: Final = "redis"
 _SENTINEL: Final = "sentinel"
 _COPY: Final = "./deploy/redis/copy:/etc/redis/copy:ro"
@@ -36,8 +36,8 @@ _LEADER: Final = """\
 		health_timeout 1s
 """
 """How a gateway finds the copy that leads; what comes during a takeover waits for it."""
-_UPSTREAM: Final = re.compile(rf"reverse_proxy ({'|'.join(_SERVICES)}):8000 {{\n")
-_TARGET: Final = re.compile(rf'"({"|".join(_SERVICES)}):8000"')
+_UPSTREAM: Final = re.compile(rf"reverse_proxy ({'|'.join(SERVICES)}):8000 {{\n")
+_TARGET: Final = re.compile(rf'"({"|".join(SERVICES)}):8000"')
 _PROCESS: Final = '"([^:]+):.*"'
 
 
@@ -77,7 +77,7 @@ def _on(service: _Part, name: str, machine: int) -> _Part:
     both = (machine, other)
     if machine > 1:  # two machines with the same label by mistake must not share data
         service["volumes"] = [re.sub(r"^([a-z-]+)(?<!-locks):", rf"\1-{machine}:", each) for each in service["volumes"]]
-    if name in _SERVICES:
+    if name in SERVICES:
         sentinels = ",".join(f"{named(_SENTINEL, each)}:{SENTINEL_PORT}" for each in range(1, MACHINES + 1))
         service["environment"] = {
             **service["environment"],
@@ -155,7 +155,7 @@ def shared_files(deploy: Path) -> dict[str, bytes]:
     gateway = gateway.replace("in [502, 504]", "in [502, 503, 504]")
     prometheus = (deploy / "prometheus" / "prometheus.yml").read_text("utf-8")
     prometheus, asked = _TARGET.subn(r'"\1:8000", "\1-2:8000"', prometheus)
-    assert doubled == asked == len(_SERVICES), "the gateway or Prometheus names a service in another way"
+    assert doubled == asked == len(SERVICES), "the gateway or Prometheus names a service in another way"
     # Alerts and dashboards name a service, whichever copy it is.
     prometheus = prometheus.replace(_PROCESS, '"([^:]+?)(?:-2)?:.*"', 1)
     return {"gateway/Caddyfile": gateway.encode(), "prometheus/prometheus.yml": prometheus.encode()}

@@ -29,7 +29,7 @@ from fog_runtime.security.users import PEER
 from fog_runtime.token_file import keep_token
 from fognav.hosting.compose_floors import BASE
 from fognav.hosting.folders import load_sites
-from fognav.hosting.swarm_copies import HOSTS, MACHINES, shared_files, shared_secrets, with_copies
+from fognav.hosting.swarm_copies import HOSTS, MACHINES, SERVICES, shared_files, shared_secrets, with_copies
 from fognav.output import WrongUseError
 from fognav.programs import CONSOLE
 
@@ -53,6 +53,12 @@ DROPPED: Final = frozenset({"build", "pull_policy", "depends_on", "restart", "se
 HEALTH: Final = {"timeout": "10s", "retries": 6}
 """Swarm kills, and forgets the name of, what compose only calls unhealthy: a busy machine must not lose its store."""
 _DEFAULT: Final = re.compile(r"^\$\{\w+:-(.+)\}$")
+ONCE_READY: Final = (
+    "fognav-ready 8000 /readyz && touch /tmp/ready || { [ -e /tmp/ready ] && fognav-ready 8000 /healthz; }"
+)
+"""The check of a service: without Redis it goes on for its robots, and must not be killed then."""
+_HEAD: Final = "# Written by `fognav stack`: run that again after an upgrade."
+_FILES: Final = ("secrets", "configs")
 _MOUNTED: Final = re.compile(r"^(?P<source>.+):(?P<target>/[^:]*)(:ro)?$")
 _SITE: Final = "/site"
 _NAME: Final = 64
@@ -127,11 +133,26 @@ def write_stacks(floors: Sequence[tuple[Path, Sequence[str]]], root: Path, out: 
         if peers[floor.id]:
             for name in made["services"].keys() & {CONSOLE, f"{CONSOLE}-2"}:
                 made["services"][name]["environment"]["FOGNAV_FLOORS_FILE"] = f"/run/fognav/{_FLOORS}"
-        file = out / f"{floor.id}.yml"
-        text = f"# Written by `fognav stack`: run that again after an upgrade.\n{yaml.safe_dump(made, sort_keys=False)}"
-        atomic_write(file, text.encode(), mode=SHARED)
-        written.append(str(file))
+        parts = {f"{floor.id}.yml": made}
+        if floor.twice:
+            parts |= {f"{floor.id}.{machine}.yml": _part(made, machine) for machine in range(1, MACHINES + 1)}
+        for name, part in parts.items():
+            text = f"{_HEAD}\n{yaml.safe_dump(part, sort_keys=False)}"
+            atomic_write(out / name, text.encode(), mode=SHARED)
+            written.append(str(out / name))
     return {"files": written, "floors": {floor.id: ",".join(floor.hosts) for floor in known}}
+
+
+def _part(stack: _Part, machine: int) -> _Part:
+    """Return what a stack has on one of its machines, so that one can be upgraded after the other."""
+    label = f"node.labels.{MACHINE} == {machine}"
+    services = {
+        name: each for name, each in stack["services"].items() if label in each["deploy"]["placement"]["constraints"]
+    }
+    used = {each["source"] for service in services.values() for kind in _FILES for each in service[kind]}
+    return {**stack, "services": services} | {
+        kind: {key: each for key, each in stack[kind].items() if key in used} for kind in _FILES
+    }
 
 
 def _peers(floor: FloorAt, floors: Sequence[FloorAt], securities: Mapping[str, SiteSecurity]) -> dict[str, bytes]:
@@ -206,7 +227,8 @@ class _Stack:
         if unknown := base.keys() - KEPT - CHANGED - DROPPED - {"x-machine", "x-of"}:
             raise WrongUseError(f"{BASE}: {name} has {min(unknown)}, of which a stack is not made: take it out")
         service: _Part = {key: value for key, value in base.items() if key in KEPT}
-        service["healthcheck"] = {**base.get("healthcheck", {}), **HEALTH}
+        check = {"test": ["CMD-SHELL", ONCE_READY]} if of in SERVICES else base.get("healthcheck", {})
+        service["healthcheck"] = {**check, **HEALTH}
         service["environment"] = dict(base.get("environment", {}))
         if base["image"].startswith(IMAGES):
             service["image"] = images + base["image"].removeprefix(IMAGES)

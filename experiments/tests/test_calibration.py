@@ -21,13 +21,14 @@ import pytest
 from fog_runtime.configuration.robot_file import parse_robot
 from fog_runtime.record import Recorder
 from fognav.output import FailedError, WrongUseError
-from fognav.robot_page import calibrating
+from fognav.robot_page import by_itself, calibrating
 from fognav.robot_page.by_itself import SPEED_M_S, SquareDrive
 from fognav.robot_page.calibrating import read, refuse_disagreement
 from fognav.robot_page.view import RobotView
 from fognav_experiments.bench.calibration import Body, driven, measure, random_body, recording
 from robot_agent.agent import local_link
-from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, BaseReceived, ScanReceived, Started
+from robot_agent.agent.hand_driving import HandReply, Steer, TakeOver
+from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, BaseReceived, Published, ScanReceived, Started
 from robot_agent.calibration import NAMES, Calibration, CalibrationError, Calibrator, Figure, changes
 from robot_agent.hardware import WheelOdometry
 from robot_agent.scan_builder import Mounting
@@ -300,7 +301,7 @@ def config_of(body):
     return next(recording(body, np.random.default_rng(1))).config
 
 
-def by_itself(config) -> list[tuple[float, float, float]]:
+def walk_by_itself(config) -> list[tuple[float, float, float]]:
     """Return what a robot that calibrates itself is told (m/s, rad/s, s): its wheels follow within 0.1 s, and count."""
     plan, now, walk = SquareDrive(config), 0.0, [(0.0, 0.0, 1.0)]
     speeds, rolled, half = np.zeros(2), np.zeros(2), 0.5 * config.drive_train.axle_m
@@ -320,7 +321,7 @@ def by_itself(config) -> list[tuple[float, float, float]]:
 @pytest.mark.parametrize("off", [0.86, 1.15])
 def test_a_robot_that_drives_by_itself_stays_in_its_square_and_tells_all_however_wrong_its_wheels_are(off):
     body = Body(left=off, right=off * 1.01, axle=2.0 - off, x=0.05, y=-0.03, yaw=0.1, latency=0.01, mirrored=False)
-    walk = by_itself(config_of(body))
+    walk = walk_by_itself(config_of(body))
     assert max(abs(v) for v, _, _ in walk) <= SPEED_M_S
     poses, _ = driven(body, np.random.default_rng(3), walk)
     assert np.abs(poses[:, :2]).max() + 0.17 < 0.6, "no part of it leaves the square"
@@ -362,3 +363,42 @@ def test_a_robot_that_drives_by_itself_stops_for_who_comes_near_for_slipping_and
     assert plan.problem(2.1) == "its wheels have not turned for 2 s"
     plan.on_counters(0.6, 0.6)
     assert "it is 0.60 m from where it stood" in plan.problem(2.2)
+
+
+def test_a_stop_while_a_robot_that_calibrates_itself_stands_between_two_rounds_ends_it(tmp_path, monkeypatch):
+    """The next round took it over again: it drove on by itself, seconds after somebody had stopped it."""
+    monkeypatch.setattr(by_itself, "_round", lambda _reach: [])
+    body = Body(left=1.0, right=1.0, axle=1.0, x=0.0, y=0.0, yaw=0.0, latency=0.0, mirrored=False)
+    entries = list(recording(body, np.random.default_rng(1), [(0.0, 0.0, 2.0)]))
+    path, said, scan = tmp_path / "agent.sock", [], [e for e in entries if isinstance(e, ScanReceived)][-1]
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def say(link, mode):
+            state = {"mode": mode, "codes": [], "reasons": [f"it is in {mode}"]}
+            link.sendall(local_link.encode(Published(channel="robot_state", ids={}, message=state)))
+
+        def serve():
+            link, _ = listener.accept()
+            with link, suppress(ConnectionError):
+                for entry in entries:
+                    link.sendall(local_link.encode(entry))
+                link.settimeout(0.1)
+                while True:
+                    link.sendall(local_link.encode(scan))
+                    with suppress(TimeoutError):
+                        if not (packet := link.recv(local_link.REQUEST_LIMIT)):
+                            return
+                        said.append(type(local_link.decode_request(packet)))
+                        if said[-1] is not Steer:
+                            link.sendall(local_link.encode(HandReply(accepted=True, reason="done")))
+                            say(link, "TELEOP")
+                            say(link, "INIT")
+
+        server = threading.Thread(target=serve)
+        server.start()
+        with pytest.raises(FailedError, match="the robot has stopped: it is in INIT"):
+            by_itself.drive(path, tmp_path / "drive.mcap", 1.2, None)
+        server.join()
+    assert said.count(TakeOver) == 1

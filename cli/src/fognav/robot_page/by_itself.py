@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -112,6 +113,7 @@ class SquareDrive:
         """Begin another round."""
         self._moves = _round(self.reach)
         self._way = self._turned = 0.0
+        self._moved_at = None
 
     def on_counters(self, left: float, right: float) -> None:
         """Take the wheels' counters in (m)."""
@@ -203,6 +205,8 @@ class _Recorded:
         self.calibrator = Calibrator()
         self.view = RobotView()
         self.moved = False
+        self.by_hand = False
+        """Whether it has told that it is driven by hand, by this tool."""
         self._robot = robot
         self._log = log
 
@@ -262,51 +266,56 @@ def _ready(heard: _Recorded, ends: Callable[[], bool]) -> AgentConfig | None:
 
 
 def _rounds(robot: LocalRobot, heard: _Recorded, plan: SquareDrive, ends: Callable[[], bool]) -> None:
-    """Drive rounds until the figures are known well; raises `FailedError` when the robot has to stop."""
-    for number in range(1, ROUNDS + 1):
-        if number > 1:
-            _look_again(heard, plan)
-        take_over(robot)
-        _drive_round(robot, heard, plan, ends)
-        robot.hand_back()  # solving takes a while, and who drives must not be silent
-        if ends():
-            return
-        try:
-            found = heard.calibrator.solve()
-        except CalibrationError as error:
-            print_line(f"round {number} of {ROUNDS}: {error}")
-        else:
-            print_line(f"round {number} of {ROUNDS}: {bars(found)}")
-            if all(share >= 1.0 for _, share in known(found)):
+    """Drive rounds until the figures are known well; raises `FailedError` when the robot has to stop.
+
+    It stays taken over while it stands between them: so a stop by anybody ends this, and no next round undoes it.
+    """
+    take_over(robot)
+    with ThreadPoolExecutor(1) as solver:
+        for number in range(1, ROUNDS + 1):
+            _drive(robot, heard, plan, lambda: plan.done or ends())
+            if ends():
                 return
-        plan.again()
+            told, known_well = _figures(robot, heard, plan, solver, ends)
+            print_line(f"round {number} of {ROUNDS}: {told}")
+            if known_well or ends() or number == ROUNDS:
+                return
+            if reason := plan.unfit(heard.view.points()):  # it stood a while, and may have looked finished
+                raise FailedError(f"the robot does not drive on by itself: {reason}")
+            plan.again()
 
 
-def _look_again(heard: _Recorded, plan: SquareDrive) -> None:
-    """Raise `FailedError` where a scan of now has something in the square: it stood a while, and may look finished."""
-    heard.poll()
-    before, until = heard.view.scan, time.monotonic() + _READY_S
-    while heard.view.scan is before:
-        if time.monotonic() > until:
-            raise FailedError(f"the robot has stopped: no scan comes within {_READY_S:g} s")
-        time.sleep(_PERIOD_S)
-        heard.poll()
-    if reason := plan.unfit(heard.view.points()):
-        raise FailedError(f"the robot does not drive on by itself: {reason}")
+def _figures(
+    robot: LocalRobot, heard: _Recorded, plan: SquareDrive, solver: ThreadPoolExecutor, ends: Callable[[], bool]
+) -> tuple[str, bool]:
+    """Stand until the figures are known, and a scan of now; return as `_solve` does. Raises as `_drive` does."""
+    asked, before = solver.submit(_solve, heard.calibrator.snapshot()), heard.view.scan
+    _drive(robot, heard, plan, lambda: (asked.done() and heard.view.scan is not before) or ends())
+    return asked.result()
 
 
-def _drive_round(robot: LocalRobot, heard: _Recorded, plan: SquareDrive, ends: Callable[[], bool]) -> None:
-    """Drive until the round is over, or is to end; raises `FailedError` when the robot has to stop."""
-    due, by_hand = time.monotonic(), False
-    while not plan.done and not ends():
+def _solve(calibrator: Calibrator) -> tuple[str, bool]:
+    """Return how well the figures are known, in words, and whether that is well enough."""
+    try:
+        found = calibrator.solve()
+    except CalibrationError as error:
+        return str(error), False
+    return bars(found), all(share >= 1.0 for _, share in known(found))
+
+
+def _drive(robot: LocalRobot, heard: _Recorded, plan: SquareDrive, ends: Callable[[], bool]) -> None:
+    """Drive, or stand once the round is over, until that ends; raises `FailedError` when the robot has to stop."""
+    due = time.monotonic()
+    while not ends():
         for entry in heard.poll():
             match entry:
                 case BaseReceived():
                     plan.on_counters(entry.feedback.odometry.left_m, entry.feedback.odometry.right_m)
-                case ScanReceived() if by_hand and (reason := plan.disturbed(heard.view.points())):
-                    raise FailedError(f"the robot has stopped: {reason}")
-                case Published() if by_hand or entry.message["mode"] == "TELEOP":
-                    by_hand = True
+                case ScanReceived() if heard.by_hand and not plan.done:
+                    if reason := plan.disturbed(heard.view.points()):
+                        raise FailedError(f"the robot has stopped: {reason}")
+                case Published() if heard.by_hand or entry.message["mode"] == "TELEOP":
+                    heard.by_hand = True
                     _heed(entry.message)
         now = time.monotonic()
         if reason := plan.problem(now):

@@ -260,7 +260,7 @@ async def test_robot_leaves_a_blocked_area_by_the_planners_way_on_a_signed_singl
 
 async def leave_dock(robot) -> None:
     """Undock the robot, again after each end that its computer's delay explains and no other."""
-    fog, begun = robot.fog, time.monotonic()
+    fog, begun, why = robot.fog, time.monotonic(), "the undocking ended: "
     while robot.body.pose[0] >= 2.45:
         assert time.monotonic() - begun < DEADLINE_S, f"it is still on its way off the dock: {fog.state}"
         before = len(fog.states)
@@ -270,11 +270,12 @@ async def leave_dock(robot) -> None:
         await until(lambda: robot.body.pose[0] < 2.45 or fog.state.mode != "DOCK", "it leaves its dock, or stops")
         if robot.body.pose[0] < 2.45:
             return
-        ended = [reason for reason in fog.state.reasons if reason.startswith("the undocking ended: ")]
-        assert len(ended) == 1, fog.state
-        assert is_by_delay(ended[0]), ended
+        await until(lambda: not fog.state.docked or why in "".join(fog.state.reasons), "it says why")
         if not fog.state.docked:
             return  # late between the charger and the end of its way: it is off its dock
+        ended = [reason for reason in fog.state.reasons if reason.startswith(why)]
+        assert len(ended) == 1, fog.state
+        assert is_by_delay(ended[0]), ended
 
 
 async def test_robot_goes_to_its_dock_and_leaves_it_on_signed_commands(tmp_path, router):

@@ -187,12 +187,16 @@ def test_robot_leaves_its_dock_and_is_enabled_afterwards_only_if_it_was_before(e
 
 
 @pytest.mark.parametrize(("changes", "words"), STOPS)
-def test_condition_that_stops_a_robot_refuses_an_undocking_and_ends_one_for_good(changes, words):
+def test_condition_that_stops_a_robot_refuses_an_undocking_and_ends_one_as_it_stops_any_drive(changes, words):
     assert words in Gate(**ON_DOCK).run(request="undock", **changes).refusal
-    gate = undocking()
-    out = gate.run(maneuver_remaining=0.2, **changes)
-    assert (out.mode, gate.state.enabled) == ("INIT", False)
-    assert any(reason.startswith("the undocking ended: ") and words in reason for reason in out.reasons)
+    gate, drive = undocking(), Gate(**ON_DOCK)
+    assert gate.run(maneuver_remaining=0.2, **changes).stop == "ramp"
+    assert words in gate.state.maneuver_end
+    assert (gate.run(**changes).mode, gate.state.latched) == (drive.run(**changes).mode, drive.state.latched)
+    leaves = "HOLD" if gate.state.latched == () else "PROTECTIVE_STOP"
+    assert gate.run(2.2).mode == leaves
+    assert gate.out.reasons[-1] == gate.state.maneuver_end
+    assert gate.run(**MISSION).mode == ("DOCK" if leaves == "HOLD" else leaves), "a mission begins it anew"
 
 
 @pytest.mark.parametrize("fault", [*FAULTS, {"bumper": True, "docked_for": None}])
@@ -207,6 +211,7 @@ def test_undocking_without_progress_ends_after_ten_seconds():
     assert gate.run(9.8, maneuver_remaining=0.3).mode == "DOCK"
     out = gate.run(0.4, maneuver_remaining=0.3, maneuver_problem="an obstacle behind")
     assert "no nearer to its end for 10 s: an obstacle behind" in "; ".join(out.reasons)
+    assert not gate.state.enabled, "it would try for ever"
 
 
 def test_undocking_ends_after_fifteen_seconds():

@@ -282,9 +282,9 @@ def _maneuver(
     ended = _interrupted(state)
     if result.done and state.enabled:
         return replace(ended, mode="HOLD", last_reasons=(rules.doing,), maneuver_end="")
-    # What holds a robot for a second must not leave one with an empty battery in front of its dock: it holds, and what
-    # needs an operator on any drive does so from the next step on.
-    enabled = state.enabled and rules.if_ended and not faults
+    # What holds a robot for a second must not leave one with an empty battery in front of its dock, or one with a
+    # mission on it: it holds, and what needs an operator on any drive does so from the next step on.
+    enabled = state.enabled and (rules.if_ended or (rules.stays_enabled and result.stopped)) and not faults
     sentence = f"{rules.name} ended: {result.reason}"
     if enabled:
         ended = replace(ended, mode="HOLD", last_reasons=(sentence,))
@@ -369,15 +369,16 @@ def _reasons(state: SafetyState, findings: list[Finding]) -> tuple[Reason, ...]:
     if state.maneuver is not None:
         waits = "as soon as its lidar runs: " if state.mode == "INIT" else ""
         return (*current, Reason(ReasonCode.MANEUVER, waits + RULES[state.maneuver.kind].doing))
+    ended = (Reason(ReasonCode.MANEUVER_ENDED, state.maneuver_end),) if state.maneuver_end else ()
     if state.mode == "INIT":
-        ended = (Reason(ReasonCode.MANEUVER_ENDED, state.maneuver_end),) if state.maneuver_end else ()
         return (*current, *ended, _NOT_ENABLED)
     latched = [
         Reason(f.reason.code, f"{f.reason} (an operator must enable again)")
         for f in state.latched
         if f.reason not in current
     ]
-    reasons = (*current, *latched)
+    # One that is on its dock still tells why; why a docking ended, the wish for the dock tells.
+    reasons = (*current, *latched, *(ended if any(finding.rest for finding in findings) else ()))
     if not reasons and state.mode != "NORMAL":
         over = "over, waiting until healthy for 2 s"
         return tuple(Reason(ReasonCode.RECOVERING, f"{over}: {reason}") for reason in state.last_reasons)

@@ -40,7 +40,7 @@ class Rules(NamedTuple):
     mode: the mode meanwhile. name, doing: what it is called, and what the robot does. relevant: the inputs that count.
     refusal: why it can't begin, besides what would end it. end: why it is over, and whether it is done. longest: s that
     it may take. cap: m/s. needs_enable: only an enabled robot begins it. stays_enabled: a robot that was enabled before
-    may drive on when it is done; if_ended: or when anything but a fault has ended it.
+    may drive on when it is done, or when what stops any drive has ended it, but no fault; if_ended: or anything else.
     """
 
     mode: Mode
@@ -286,10 +286,11 @@ class Maneuver(msgspec.Struct, frozen=True):
 
 
 class End(NamedTuple):
-    """Why a maneuver ended, and whether it is done."""
+    """Why a maneuver ended, whether it is done, and whether a condition that stops any drive has ended it."""
 
     reason: str
     done: bool = False
+    stopped: bool = False
 
 
 def begin(kind: ManeuverKind, inputs: SafetyInputs, now: float, config: SafetyConfig) -> Maneuver | Reason:
@@ -321,7 +322,7 @@ def proceed(
     rules = RULES[maneuver.kind]
     stops = [finding.reason for finding in findings if finding.level >= Level.HOLD and not finding.rest]
     if stops:
-        return End("; ".join(stops))
+        return End("; ".join(stops), stopped=True)
     if inputs.resting is not None:
         return replace(maneuver, since=now, shrank_at=now)
     if (end := rules.end(inputs, config)) is not None:

@@ -20,6 +20,7 @@ from robot_agent.agent import service as service_module
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.edges.map_loader import MapLoader, Store
 from robot_agent.agent.service import Service
+from robot_agent.localization.pose import SavedPose
 
 
 class Fog:
@@ -393,3 +394,16 @@ async def test_an_error_in_a_decision_ends_a_loop_of_the_agent(rig, decisions):
         task.cancel()
     await asyncio.gather(*others, return_exceptions=True)
     assert [task.exception() for task in done] == [decisions.failure]
+
+
+async def test_pose_that_a_full_disk_has_refused_is_stored_once_there_is_room(tmp_path, monkeypatch):
+    folder = tmp_path / "data"
+    folder.write_text("where no folder can be")
+    rig = Rig(folder)
+    pose = SavedPose(site="lab", x=1.0, y=2.0, theta=3.0, sigma_xy=0.1, sigma_theta=0.1)
+    told = iter([pose])
+    monkeypatch.setattr(rig.core, "pose_to_store", lambda _now: next(told, None))
+    await rig.service._store_pose(1.0)
+    folder.unlink()
+    await rig.service._store_pose(2.0)
+    assert Store(folder).pose("lab") == pose

@@ -100,6 +100,8 @@ class Service:
         self._tasks: set[asyncio.Task[None]] = set()
         self._store = store
         self._storing = False
+        self._unstored: SavedPose | None = None
+        """The pose that could not be stored."""
         self._clock = clock
         self._health = health
         self._robot = core.robot
@@ -157,15 +159,19 @@ class Service:
             ticker.period = HOUSEKEEPING_S if self._health.ready else STREAM_S
 
     async def _store_pose(self, now: float) -> None:
-        if not self._storing and (pose := self._core.pose_to_store(now)) is not None:
+        # A robot that stands tells its pose once: what a full disk has refused is tried again.
+        if not self._storing and (pose := self._core.pose_to_store(now) or self._unstored) is not None:
             await self._put_pose(pose)
 
     async def _put_pose(self, pose: SavedPose) -> None:
         self._storing = True
         try:
             await asyncio.to_thread(self._store.put_pose, pose)
+            self._unstored = None
         except OSError as error:
-            _log.error("pose_not_stored", reason=str(error))
+            if self._unstored is None:
+                _log.error("pose_not_stored", reason=str(error), remedy="it is tried again")
+            self._unstored = pose
         finally:
             self._storing = False
 

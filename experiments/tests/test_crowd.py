@@ -134,6 +134,25 @@ def test_robot_among_walking_people_touches_none_and_arrives_or_says_why_it_stan
 
 
 @pytest.mark.drive
+def test_robot_that_somebody_passes_in_a_watched_area_goes_on_by_itself():
+    run = ring.Run(seed=1)
+    modes = set()
+    run.enable()
+    run.send()
+    run.until(lambda: run.world.pose[0] > 7.2, 60.0)
+    began, passer = run.system.now, Person(0, np.random.default_rng(1))
+    while (walked := 0.8 * (run.system.now - began)) < 2.3:
+        passer.place = 6.5 + walked, 1.3
+        run.world.place(passer.outline())
+        run.step()
+        modes.add(run.state.mode)
+    run.world.remove(passer.id)
+    assert "PROTECTIVE_STOP" in modes, "the area is blocked round the robot"
+    run.until(lambda: run.state.goal_reached, 60.0)
+    assert run.world.contacts == 0
+
+
+@pytest.mark.drive
 def test_a_drive_among_people_tells_what_nodes_reported_of_them_and_what_they_cost(tmp_path):
     spec = ExperimentSpec(routes=[RouteSpec(start="west", goal="east", areas=["z1"])])
     drives = [people_drive(ring.ring_site(), "", task) for task in people_tasks(spec, 1, 1, [4])]

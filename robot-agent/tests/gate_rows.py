@@ -138,6 +138,13 @@ ROWS = [
         left="operator",
         by_hand="goes on",
     ),
+    Row(
+        "in an area that only sensors block",
+        {"inside_blocked": "the blocked area x", "inside_watched": True},
+        "PROTECTIVE_STOP",
+        "the robot is in the blocked area x",
+        by_hand="goes on",
+    ),
     Row("map lost", {"map_age": 3.01}, "HOLD", "the map is 3.0 s old", not_yet={"map_age": 0.99}, by_hand="goes on"),
     Row("map late", {"map_age": 1.01}, "DEGRADED", "the map is 1.0 s old", not_yet={"map_age": 1.0}, by_hand="goes on"),
     Row("map still late", {"map_age": 3.0}, "DEGRADED", "the map is 3.0 s old", by_hand="goes on"),

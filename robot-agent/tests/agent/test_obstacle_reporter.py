@@ -381,6 +381,8 @@ def test_an_area_is_named_by_its_label_unless_it_is_clear(state, description, ca
     assert found.containing(HERE, lethal(), ObstacleReporter(10.0, 3, 0.17), 0.0) == (
         description or "a blocked part of the map"
     )
+    assert found.only_watched(HERE)
+    assert not found.only_watched(Pose2(1.0, 1.0, 0.0))
     assert (found.caution(HERE) is not None) == caution
     assert found.caution(Pose2(1.0, 1.0, 0.0)) is None
 
@@ -406,4 +408,5 @@ def test_zone_that_is_not_in_force_is_no_reason_to_stop_for_an_own_obstacle():
     assert report([(5.02, 5.02), (5.04, 5.04)], reporter=reporter).points
     zone = Zone(id="nights", kind="BLOCKED", shape=CircleShape(centre=(5.0, 5.0), radius=1.0))
     assert places(zones=[zone]).containing(HERE, lethal(), reporter, 0.0) == "the no-go zone nights"
+    assert not places(hazards=[("blocked", SQUARE)], zones=[zone]).only_watched(HERE)
     assert places(zones=[zone], off=["nights"]).containing(HERE, lethal(), reporter, 0.0) is None

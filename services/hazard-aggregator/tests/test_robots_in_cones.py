@@ -52,6 +52,15 @@ def test_echo_of_a_robot_in_the_cone_does_not_clear_a_blocked_area():
     assert rig.hazard.state == "blocked"
 
 
+def test_area_is_clear_again_when_somebody_has_walked_between_the_node_and_a_robot():
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    for seen, expected in ((0.83, "clear"), (0.45, "blocked"), (0.83, "clear")):
+        read_beside_robot(rig, pose(1.0, 0.5), (seen, 3.0), times=12)
+        assert rig.hazard.state == expected
+    assert rig.hazard.explained_by == "r1"
+
+
 @pytest.mark.parametrize(
     ("robot", "ranges"),
     [

@@ -290,6 +290,7 @@ class AgentCore:
             self._driving.mission,
             path_problem=self._driving.path_problem(self.replica, self._guard, self.safety, now),
             inside_blocked=self._navigation.inside_blocked(trusted, self._reporter, now) if trusted else None,
+            inside_watched=trusted is not None and self._navigation.inside_watched(trusted),
             blocked_ahead=self._navigation.blocked_ahead(trusted, ahead, self._reporter, now) if trusted else None,
             near_blocked=self._navigation.near_blocked(trusted) if trusted else None,
             maneuver=maneuver,

@@ -90,6 +90,17 @@ class BlockedPlaces:
         """Return the name of the area or zone that blocks where the robot's centre is (m, frame `map`), if one does."""
         return self._named(pose) if _is_blocked(replica, pose) else None
 
+    def only_watched(self, pose: Pose2) -> bool:
+        """Whether no operator, but sensors may block where the robot's centre is: who passes it is gone again.
+
+        An area that is clear counts, too: the map may follow a moment later.
+        """
+        areas = (area for area in self._hazards.values() if contains_point(area.polygon, pose.x, pose.y))
+        hazards = [area.hazard for area in areas]
+        overridden = any(hazard.override is not None for hazard in hazards)
+        zones = any(shape_contains(zone.shape, pose.x, pose.y) for zone in self._zones)
+        return bool(hazards) and not overridden and not zones
+
     def closed(self, geometry: GridGeometry) -> dict[str, Spans]:
         """Return the cells of each blocked area and no-go zone, by a name that changes with them."""
         closed: dict[str, Spans] = {}
@@ -305,6 +316,10 @@ class Navigation:
         if self._onboard is None:
             return self._places.containing(pose, self.replica, reporter, now)
         return self._places.named(pose, self.replica) if self.profile.hazards else None
+
+    def inside_watched(self, pose: Pose2) -> bool:
+        """Whether what blocks the place of a robot is sensors alone, which also tell when it is clear again."""
+        return self._places.only_watched(pose)
 
     def blocked_ahead(self, pose: Pose2, way: float, reporter: ObstacleReporter, now: float) -> str | None:
         """Return the name of a blocked place that the body would reach, `way` m straight ahead; None at 0 m."""

@@ -39,11 +39,12 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been
     missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
     released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
-    the robot is in; blocked_ahead: the one on the way of an advance that runs or is asked for, both by a pose that is
-    good or weak; near_blocked: the one that it may be in, ahead, by how uncertain the pose is. position_sigma: standard
-    deviation (m) of the position in its least certain direction. maneuver_remaining: m to the end of the maneuver that
-    runs, rad of a turn, infinite while not known. maneuver_problem: what keeps the robot from getting there.
-    dock_problem: why the base must not drive into its dock by itself. caution: a reason to drive slowly here.
+    the robot is in, `inside_watched` if sensors alone block it; blocked_ahead: the one on the way of an advance that
+    runs or is asked for, both by a pose that is good or weak; near_blocked: the one that it may be in, ahead, by how
+    uncertain the pose is. position_sigma: standard deviation (m) of the position in its least certain direction.
+    maneuver_remaining: m to the end of the maneuver that runs, rad of a turn, infinite while not known.
+    maneuver_problem: what keeps the robot from getting there. dock_problem: why the base must not drive into its dock
+    by itself. caution: a reason to drive slowly here.
     guardian_lost: why there is no link to the guardian.
     base_fault: the guardian's fault, latched there unless it is `base_fault_passing`, which ends with its cause.
     base_stopped: why the guardian keeps the wheels at zero. wheels_differ: it counts by other ones than the agent.
@@ -79,6 +80,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     released_remaining: float = 0.0
     path_problem: Reason | None = None
     inside_blocked: str | None = None
+    inside_watched: bool = False
     blocked_ahead: str | None = None
     near_blocked: str | None = None
     position_sigma: float = 0.0
@@ -121,7 +123,8 @@ def _always(_: SafetyInputs) -> bool:
 class Condition(NamedTuple):
     """One row of the table; `holds` gets inputs and limits, `sentence` gets the inputs. The rest as in `Finding`.
 
-    `code`: unless the sentence brings its own. `by_delay`: whether a computer that ran late explains it.
+    `code`: unless the sentence brings its own. `by_delay`: whether a computer that ran late explains it. `passes`:
+    whether it needs no operator, because what it rests on ends by itself.
 
     An age that is no number fails every comparison with its limit, so it counts as too old.
     """
@@ -133,6 +136,7 @@ class Condition(NamedTuple):
     operator: bool = False
     about_map: bool = False
     by_delay: Callable[[SafetyInputs], bool] = _never
+    passes: Callable[[SafetyInputs], bool] = _never
     rest: bool = False
 
 
@@ -289,6 +293,7 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
         lambda i, _: i.inside_blocked is not None,
         lambda i: f"the robot is in {i.inside_blocked}",
         operator=True,
+        passes=lambda i: i.inside_watched,
     ),
     # --- map ---
     Condition(
@@ -360,7 +365,7 @@ def _finding(condition: Condition, inputs: SafetyInputs, config: SafetyConfig) -
     return Finding(
         condition.level,
         Reason(code, sentence + cause),
-        condition.operator,
+        condition.operator and not condition.passes(inputs),
         condition.about_map,
         late,
         condition.rest,

@@ -55,6 +55,8 @@ _EXPLAINED_PAUSE_S: Final = 3.0
 TAKEN_BACK_MAX: Final = 3
 """So often poses that come late take back what a node saw, until it sees a clear area: they may be invented."""
 _UNEXPLAINED_MAX: Final = 300
+_PAST_M: Final = 0.2
+"""A robot's echo from so much farther away shows that what blocked is gone: a pose is some centimetres off."""
 _REPEATED_S: Final = 1.0
 _ALIKE_M: Final = 0.02
 """A reading that differs by so little from the last one of these is kept once in this time: 300 last for minutes."""
@@ -84,6 +86,8 @@ class NodeState:
     explained_at: float = -math.inf
     unexplained: list[tuple[float, NodeReading]] = field(default_factory=list)
     """The readings with echoes that no robot explained, since one confirmed that the area is clear."""
+    blocked_at: dict[int, float] = field(default_factory=dict)
+    """The farthest echo (m) of each sonar that no robot explained, since the area was clear."""
     taken_back: int = 0
     run_state: AreaState | None = None
     run_began: float = 0.0
@@ -127,6 +131,7 @@ class NodeState:
         self.explained_by = None
         self.run_state = None
         self.unexplained = []
+        self.blocked_at = {}
         self.rule.reset()
 
     @property
@@ -186,11 +191,12 @@ class NodeState:
         self.free = self.far_wall.on_reading(classification.sonars if counts else None, taken_at)
         if classification.explained_by is not None:
             self._apply_explained(classification.explained_by, taken_at)
+            classification = self._past(classification)
+        too_long = classification.state == "clear" and self._explained_too_long(taken_at)
+        if classification.explained_by is not None or not counts or too_long:
             return
-        if not counts or (classification.state == "clear" and self._explained_too_long(taken_at)):
-            return
-        if classification.state == "blocked" and reading is not None and not self._is_known(taken_at, reading):
-            self.unexplained.append((taken_at, reading))
+        if classification.state == "blocked":
+            self._note_blocked(classification, taken_at, reading)
         if classification.state != self.run_state and not (classification.state == "unknown" and self.run_state):
             self.run_state = classification.state
             self.run_began = stamp
@@ -203,6 +209,7 @@ class NodeState:
             self.run_state = None
         elif confirmed == "clear":
             self.unexplained.clear()
+            self.blocked_at.clear()
             self.taken_back = 0
         if confirmed != "unknown" and self.flaps.update(confirmed, taken_at):
             self.flap()
@@ -210,6 +217,14 @@ class NodeState:
         if confirmed != self.state or self.unconfirmed:
             # Later readings of the same state leave the reason: the hazard would change with every centimetre.
             self.state, self.reason, self.unconfirmed = confirmed, classification.reason, False
+
+    def _note_blocked(self, classification: Classification, taken_at: float, reading: NodeReading | None) -> None:
+        """Keep what no robot explains of a reading."""
+        if reading is not None and not self._is_known(taken_at, reading):
+            self.unexplained.append((taken_at, reading))
+        for number, sonar in enumerate(classification.sonars):
+            if sonar.state == "blocked" and sonar.range_m is not None and not sonar.explained:
+                self.blocked_at[number] = max(sonar.range_m, self.blocked_at.get(number, 0.0))
 
     def _is_known(self, taken_at: float, reading: NodeReading) -> bool:
         """Whether a reading adds nothing to those that no robot explained: it repeats the last, or they are full."""
@@ -238,6 +253,24 @@ class NodeState:
             unexplained = self.unexplained  # poses that are under way may explain them still
             self.invalidate(Reason(NodeCode.ROBOT_STAYS, reason))
             self.unexplained = unexplained
+
+    def _past(self, classification: Classification) -> Classification:
+        """Return a clear reading in place of an explained one whose sonars hear the robot beyond all that blocked.
+
+        Where they don't, what blocked may still stand there, and it is returned as it is. Who walks between a node and
+        a robot would shut the robot in otherwise, since all that the node hears from then on is the robot.
+        """
+        if self.state != "blocked" or not self.blocked_at:
+            return classification
+        samples = []
+        for number, sonar in enumerate(classification.sonars):
+            beyond = self.blocked_at.get(number, -math.inf) + _PAST_M
+            gone = sonar.explained and sonar.range_m is not None and sonar.range_m > beyond
+            samples.append(sonar._replace(state="clear", explained=False) if gone else sonar)
+        if any(sample.state != "clear" for sample in samples):
+            return classification
+        reason = Reason(NodeCode.NOTHING_NEAR, f"what blocked is gone: {classification.reason}")
+        return classification._replace(state="clear", reason=reason, explained_by=None, sonars=tuple(samples))
 
     def _explained_too_long(self, taken_at: float) -> bool:
         return taken_at - self.explained_at <= _EXPLAINED_PAUSE_S and taken_at - self.explained_since > EXPLAINED_S

@@ -12,11 +12,11 @@ from fog_contracts.costs import FREE, LETHAL
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.raycast import cast
 from fog_mapping.building import draw, find_trajectory
-from fog_mapping.loops import LoopSearch
-from fog_mapping.poses import between, compose, place
+from fog_mapping.loops import LoopSearch, _neighbours
+from fog_mapping.poses import Edge, between, compose, place
 from fog_mapping.relations import absolute_error, relation_errors
 from fog_mapping.scans import Scan, keep_moved, scan_of
-from fog_mapping.trajectory import refuse_mirrored
+from fog_mapping.trajectory import _AROUND, _Cells, refuse_mirrored
 
 CELL = 0.05
 BEAMS = np.radians(np.arange(240) * 1.5 - 180.0)
@@ -258,3 +258,30 @@ def test_scan_that_shows_little_is_left_out_and_one_without_odometry_refused():
     assert scan_of(3, BEAMS, np.full(len(BEAMS), np.nan), (0.0, 0.0, 0.0), RANGE_M) is None
     with pytest.raises(ValueError, match="scan 3: the odometry must be x, y and theta, finite"):
         scan_of(3, BEAMS, np.full(len(BEAMS), 1.0), (0.0, math.nan, 0.0), RANGE_M)
+
+
+def test_a_way_of_many_scans_between_joints_makes_as_uncertain_as_each_of_its_steps():
+    rng = np.random.default_rng(1)
+    joints = np.array([0, 7, 12, 13, 20, 29])
+    ends = [(i, i + 1) for i in range(29)] + [(0, 20), (29, 12)]
+    edges = [
+        Edge(first, second, rng.uniform(-0.5, 0.5, 3), np.diag(rng.uniform(50.0, 900.0, 3)), second != first + 1)
+        for first, second in ends
+    ]
+    for number, joint in enumerate(joints):
+        each = _neighbours(np.arange(30), edges, np.ones(len(edges))).seen_from(int(joint))
+        joined = _neighbours(joints, edges, np.ones(len(edges))).seen_from(number)
+        for one, other in zip(each, joined, strict=True):
+            assert other == pytest.approx(one[joints])
+
+
+def test_the_scans_around_one_are_the_nearest_of_all_wherever_they_have_moved():
+    rng = np.random.default_rng(1)
+    poses = np.column_stack((rng.normal(0.0, 3.0, (400, 2)), np.zeros(400)))
+    cells = _Cells(poses)
+    for i in rng.integers(0, 400, 300).tolist():
+        away = np.hypot(*(poses[:, :2] - poses[i, :2]).T)
+        nearest = [j for j in np.argsort(away, kind="stable")[:_AROUND].tolist() if away[j] < 4.0 and j != i]
+        assert cells.nearest(i) == nearest
+        poses[i, :2] += rng.normal(0.0, 0.5, 2)
+        cells.moved(i)

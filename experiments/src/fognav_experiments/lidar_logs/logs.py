@@ -194,15 +194,19 @@ def _carmen_scan(line: str) -> LogScan | None:
 def _finished(scans: list[LogScan], *, coded: bool = True, leaps: bool = True) -> LidarLog:
     """Remove codes for "no return", if ranges are coded, make the stamps increase, and tell odometry from reference.
 
-    leaps: whether stamps that leap far ahead are wrong, rather than a pause of the log. Those after a leap leap along.
+    The list is emptied as it goes: a long log need not fit into memory twice. leaps: whether stamps that leap far ahead
+    are wrong, rather than a pause of the log. Those after a leap leap along.
     """
     code = _no_return_code(scans) if coded else math.inf
     offset = before_leap = -scans[0].stamp
     last = -math.inf
     finished: list[LogScan] = []
+    stamps = [scan.stamp for scan in scans]
     steady, mended = _median_period(scans), 0
     most = _LEAP_PERIODS * steady if leaps else math.inf
-    for scan in scans:
+    scans.reverse()
+    while scans:
+        scan = scans.pop()
         stamp = scan.stamp + offset
         if finished and not last < stamp < last + most and last < scan.stamp + before_leap < last + most:
             offset = before_leap  # a single stamp leapt
@@ -217,30 +221,30 @@ def _finished(scans: list[LogScan], *, coded: bool = True, leaps: bool = True) -
     moved = [scan for scan in finished if scan.reference is not None and _offset(scan) != _offset(finished[0])]
     if finished[0].reference is not None and not any(_differs(finished[0], scan) for scan in moved):
         return LidarLog(tuple(finished), odometry_measured=False, stamps_mended=mended)
-    return LidarLog(tuple(_without_leaps(scans, finished)), odometry_measured=True, stamps_mended=mended)
+    return LidarLog(tuple(_without_leaps(stamps, finished)), odometry_measured=True, stamps_mended=mended)
 
 
-def _without_leaps(raw: list[LogScan], finished: list[LogScan]) -> Iterator[LogScan]:
+def _without_leaps(stamps: list[float], finished: list[LogScan]) -> Iterator[LogScan]:
     """Yield scans whose odometry goes on where it has leapt: a break of it, over which the robot hardly moved.
 
-    By the stamps of the log itself: mended ones do not tell how long a pause was. Raises `WrongUseError` where it
+    By the stamps (s) of the log itself: mended ones do not tell how long a pause was. Raises `WrongUseError` where it
     leaps all the time.
     """
     shift: Pose2 | None = None
     breaks = 0
-    before, odom = raw[0], raw[0].odom
-    for scan, done in zip(raw, finished, strict=True):
-        far, passed = math.hypot(*scan.odom.relative_to(before.odom)[:2]), scan.stamp - before.stamp
+    before, told, odom = stamps[0], finished[0].odom, finished[0].odom
+    for stamp, scan in zip(stamps, finished, strict=True):
+        far, passed = math.hypot(*scan.odom.relative_to(told)[:2]), stamp - before
         if far > _LEAP_M and 0.0 < passed < far / _LEAP_M_S:
             shift, breaks = odom.compose(Pose2(0.0, 0.0, 0.0).relative_to(scan.odom)), breaks + 1
-            if breaks > max(_LEAPS, _LEAPS_SHARE * len(raw)):
+            if breaks > max(_LEAPS, _LEAPS_SHARE * len(stamps)):
                 raise WrongUseError(
                     f"the odometry goes faster than {_LEAP_M_S:g} m/s again and again, as by {far:.1f} m in "
                     f"{passed:.2f} s: is it in metres, and are the stamps in seconds?"
                 )
         odom = scan.odom if shift is None else shift.compose(scan.odom)
-        before = scan
-        yield done if shift is None else replace(done, odom=odom, stretch=done.stretch + breaks)
+        before, told = stamp, scan.odom
+        yield scan if shift is None else replace(scan, odom=odom, stretch=scan.stretch + breaks)
 
 
 def _offset(scan: LogScan) -> Pose2:
@@ -254,12 +258,15 @@ def _differs(first: LogScan, scan: LogScan) -> bool:
 
 
 def _no_return_code(scans: list[LogScan]) -> float:
-    readings = np.concatenate([scan.ranges for scan in scans])
-    readings = readings[np.isfinite(readings)]
-    if not len(readings):
+    largest, finite = -math.inf, 0
+    for scan in scans:
+        seen = scan.ranges[np.isfinite(scan.ranges)]
+        largest, finite = max(largest, float(seen.max(initial=-math.inf))), finite + len(seen)
+    if not finite:
         return math.inf
-    limit = _CODE_SHARE * float(readings.max())
-    return limit if (readings > limit).mean() > _CODE_READINGS else math.inf
+    limit = _CODE_SHARE * largest
+    coded = sum(int((np.isfinite(scan.ranges) & (scan.ranges > limit)).sum()) for scan in scans)
+    return limit if coded / finite > _CODE_READINGS else math.inf
 
 
 def _median_period(scans: list[LogScan]) -> float:

@@ -81,16 +81,20 @@ def draw(rays: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], resolu
     Each scan counts once in a cell. What most scans look through was no wall: people and things that have moved are
     left out. Raises `ValueError` for a map that is too large.
     """
-    placed = [(pose, place(pose, points)) for pose, points in rays]
-    everything = np.concatenate([points for _, points in placed] + [np.array([pose[:2] for pose, _ in placed])])
-    low = np.floor((everything.min(axis=0) - _MARGIN_M) / resolution) * resolution
-    width, height = np.ceil((everything.max(axis=0) + _MARGIN_M - low) / resolution).astype(int).tolist()
+    # Placed twice rather than kept: all points of a long log would take as much memory as its scans.
+    taken = list(rays)
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for pose, points in taken:
+        seen = np.vstack((place(pose, points), pose[:2]))
+        low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
+    low = np.floor((low - _MARGIN_M) / resolution) * resolution
+    width, height = np.ceil((high + _MARGIN_M - low) / resolution).astype(int).tolist()
     if width * height > _MAX_CELLS:
         raise ValueError(
             f"the map would have {width} x {height} cells. Choose a coarser --resolution, if a building of "
             f"{width * resolution:.0f} x {height * resolution:.0f} m is right; else are ranges and odometry in metres?"
         )
     counts = BeamCounts((height, width), resolution, float(low[0]), float(low[1]))
-    for pose, points in placed:
-        counts.add(float(pose[0]), float(pose[1]), points)
+    for pose, points in taken:
+        counts.add(float(pose[0]), float(pose[1]), place(pose, points))
     return StaticMap(GridGeometry(width, height, resolution, float(low[0]), float(low[1])), counts.cells())

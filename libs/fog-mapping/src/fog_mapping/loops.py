@@ -7,8 +7,10 @@ look the same, and a fold would be drawn. What is certain is closed first, which
 
 from __future__ import annotations
 
+import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -142,6 +144,7 @@ class LoopSearch:
         self._places = list(_stretches(self._way, _PLACE_EVERY_M, _PLACE_HALF_M))
         self._queries = list(_stretches(self._way, _STRETCH_EVERY_M, _STRETCH_HALF_M))
         self._ends = np.array(self._queries, np.int64).reshape(-1, 3)
+        self._joints = np.unique([0, len(scans) - 1, *(one.middle for one in (*self._places, *self._queries))])
         self._without = [(self._way[first], self._way[second]) for first, second in without]
         self._tried: dict[tuple[int, int], float] = {}
         self._jobs = jobs
@@ -155,12 +158,12 @@ class LoopSearch:
         on_progress: Callable[[float], object] = lambda _: None,
     ) -> Searched:
         """Look for what may be a loop and is certain to `most` (m); the same for the same arguments."""
-        neighbours = _neighbours(len(self._scans), edges, weights)
+        neighbours = _neighbours(self._joints, edges, weights)
         joined: list[Edge] = []
         loops: list[Loop] = []
         ambiguous = 0
         with ThreadPoolExecutor(self._jobs) as pool:
-            places = pool.map(lambda k: self._search_place(k, poses, neighbours, most), range(len(self._places)))
+            places = pool.map(partial(self._search_place, poses, neighbours, most), range(len(self._places)))
             for done, found in enumerate(places, 1):
                 joined.extend(found.edges)
                 loops.extend(found.loops)
@@ -168,10 +171,12 @@ class LoopSearch:
                 on_progress(done / len(self._places))
         return Searched(joined, loops, ambiguous)
 
-    def _search_place(self, number: int, poses: NDArray[np.float64], neighbours: Neighbours, most: float) -> Searched:
+    def _search_place(self, poses: NDArray[np.float64], neighbours: Neighbours, most: float, number: int) -> Searched:
         place = self._places[number]
-        wanted = sorted(self._candidates(number, poses, *neighbours.seen_from(place.middle), most))[:_MOST_TRIED]
-        for _, index, half, _ in wanted:
+        joint = int(np.searchsorted(self._joints, place.middle))
+        known = neighbours.seen_from(joint, (most / _SIGMAS) ** 2 * (1.0 + 1e-9))
+        wanted = list(itertools.islice(self._candidates(number, poses, *known, most), _MOST_TRIED))
+        for index, half, _ in wanted:
             self._tried[number, index] = half
         edges: list[Edge] = []
         loops: list[Loop] = []
@@ -179,7 +184,7 @@ class LoopSearch:
         if not wanted:
             return Searched(edges, loops, ambiguous)
         reference = reference_of(self._scans, poses, range(place.first, place.last + 1), poses[place.middle])
-        for _, index, half, half_turn in wanted:
+        for index, half, half_turn in wanted:
             query = self._queries[index]
             points, lines = thinned(
                 *cloud(self._scans, poses, range(query.first, query.last + 1), poses[query.middle]), _THIN_M
@@ -213,23 +218,28 @@ class LoopSearch:
         variance: NDArray[np.float64],
         turn_variance: NDArray[np.float64],
         most: float,
-    ) -> Iterator[tuple[float, int, float, float]]:
-        """Yield the stretches that may be at a place: how far off they seem, number, how far and turned to look."""
+    ) -> Iterator[tuple[int, float, float]]:
+        """Yield the stretches that may be at a place, the nearest first: number, how far and turned to look.
+
+        variance, turn_variance: of the joints.
+        """
         place = self._places[number]
         middles, first, last = self._ends.T
-        off = _SIGMAS * np.sqrt(variance[middles])
+        joints = np.searchsorted(self._joints, middles)
+        off = _SIGMAS * np.sqrt(variance[joints])
         away = np.hypot(*(poses[middles, :2] - poses[place.middle, :2]).T)
         apart = (first > place.last) | (place.first > last)
         apart &= np.abs(self._way[middles] - self._way[place.middle]) >= _LEAST_WAY_M
-        for index in np.flatnonzero(apart & (off <= most) & (away <= _NEAR_M + off)).tolist():
+        near = np.flatnonzero(apart & (off <= most) & (away <= _NEAR_M + off))
+        for index in near[np.argsort(away[near], kind="stable")].tolist():
             half = max(_LEAST_M, float(off[index]))
             # Looked for again once it is clearly more certain where.
             if half >= _REPEATED * self._tried.get((number, index), math.inf):
                 continue
             query = self._queries[index]
             if not self._is_refused(place, query):
-                turn = _SIGMAS * math.sqrt(turn_variance[query.middle])
-                yield float(away[index]), index, half, min(max(_LEAST_RAD, turn), _MOST_RAD)
+                turn = _SIGMAS * math.sqrt(turn_variance[joints[index]])
+                yield index, half, min(max(_LEAST_RAD, turn), _MOST_RAD)
 
     def _is_refused(self, place: Stretch, query: Stretch) -> bool:
         ends = sorted((self._way[place.middle], self._way[query.middle]))
@@ -246,11 +256,28 @@ def _stretches(way: NDArray[np.float64], every: float, half: float) -> Iterator[
             yield Stretch(int(np.argmin(np.abs(way - at))), int(inside[0]), int(inside[-1]))
 
 
-def _neighbours(count: int, edges: Sequence[Edge], weights: NDArray[np.float64]) -> Neighbours:
+def _neighbours(joints: NDArray[np.int64], edges: Sequence[Edge], weights: NDArray[np.float64]) -> Neighbours:
+    """Return how certain the joints are as seen from one another; all ends of loops are joints.
+
+    The way of many scans between two joints, which nothing else meets, counts as one step.
+    """
     used = [edge for edge, weight in zip(edges, weights, strict=True) if not (edge.loop and weight < _KEPT)]
     covariance = np.linalg.inv(np.array([edge.information for edge in used]) + 1e-6 * np.eye(3))
     steps = np.array([edge.step for edge in used])
-    figures = np.column_stack(
-        (covariance[:, 0, 0] + covariance[:, 1, 1], covariance[:, 2, 2], steps[:, 0] ** 2 + steps[:, 1] ** 2)
+    square = steps[:, 0] ** 2 + steps[:, 1] ** 2
+    # The way's edges come first, one from each scan to the next: what turns up to there add at the lever of each step.
+    last, turn = int(joints[-1]), covariance[:, 2, 2]
+    turned = np.concatenate(((0.0,), np.cumsum(turn[:last])))
+    begin, end = (np.repeat(turned[some], np.diff(joints)) for some in (joints[:-1], joints[1:]))
+    onward, back = turn.copy(), turn.copy()
+    onward[:last], back[:last] = turned[1:] - begin, end - turned[:-1]
+    added = (covariance[:, 0, 0] + covariance[:, 1, 1])[:, None] + np.column_stack((onward, back)) * square[:, None]
+    figures = np.column_stack((added, turn, square))
+    way = np.add.reduceat(figures[:last], joints[:-1], axis=0)
+    numbers = np.arange(len(joints))
+    loops = np.searchsorted(joints, [(edge.first, edge.second) for edge in used[last:]]).reshape(-1, 2)
+    return Neighbours(
+        len(joints),
+        np.concatenate((np.column_stack((numbers[:-1], numbers[1:])), loops)),
+        np.concatenate((way, figures[last:])),
     )
-    return Neighbours(count, np.array([(edge.first, edge.second) for edge in used], np.int64), figures)

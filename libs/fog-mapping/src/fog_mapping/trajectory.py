@@ -5,6 +5,7 @@ from __future__ import annotations
 import cmath
 import itertools
 import math
+from collections import defaultdict
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -29,6 +30,10 @@ _SPURIOUS: Final = 0.02
 WINDOW: Final = 12
 """Scans before it that one is matched to."""
 _SPREAD_M: Final = 8.0
+_AROUND: Final = 40
+"""Scans around one, by place, that it is to fit in the end."""
+_CELL_M: Final = 1.0
+"""Where a robot comes again and again, so many are nearer than that."""
 _TURN_STEP: Final = math.radians(1.0)
 _SEARCHED_SIGMAS: Final = 2.5
 _MOST_M: Final = 0.6
@@ -153,17 +158,52 @@ def settle(scans: Sequence[Scan], poses: NDArray[np.float64], sweeps: int = 2) -
     settled = poses.copy()
     gates = np.array((0.2, 0.2, 0.12, 0.12, 0.08, 0.08))
     stay = np.diag((100.0, 100.0, 400.0))
+    cells = _Cells(settled)
     for _ in range(sweeps):
         for i in range(1, len(scans)):
-            away = np.hypot(*(settled[:, :2] - settled[i, :2]).T)
-            near = np.nonzero(away < 0.5 * _SPREAD_M)[0]
-            nearest = near[np.argsort(away[near], kind="stable")[:_AROUND]]
-            around = [int(j) for j in nearest if j != i]
+            around = cells.nearest(i)
             if around:
                 others = reference_of(scans, settled, around)
                 pose = tuple(settled[i])
                 settled[i] = others.align(scans[i].points, scans[i].normals, pose, pose, stay, gates).pose
+                cells.moved(i)
     return settled
 
 
-_AROUND: Final = 40
+class _Cells:
+    """Which of many poses lie in which square: one that is asked for its nearest need not look at all."""
+
+    def __init__(self, poses: NDArray[np.float64]) -> None:
+        """`poses`: (n, 3; m, rad), which may change, each followed by a call of `moved`."""
+        self._poses = poses
+        self._cell_of = [self._cell(i) for i in range(len(poses))]
+        self._members: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
+        for i, cell in enumerate(self._cell_of):
+            self._members[cell].append(i)
+
+    def _cell(self, i: int) -> tuple[int, int]:
+        return math.floor(self._poses[i, 0] / _CELL_M), math.floor(self._poses[i, 1] / _CELL_M)
+
+    def moved(self, i: int) -> None:
+        """Take in where pose `i` is now."""
+        before, now = self._cell_of[i], self._cell(i)
+        if now != before:
+            self._members[before].remove(i)
+            self._members[now].append(i)
+            self._cell_of[i] = now
+
+    def nearest(self, i: int) -> list[int]:
+        """Return the nearest poses, `_AROUND` with `i` itself, nearest first: it is left out."""
+        found = self._within(i, 1)
+        if len(found) < _AROUND:
+            found = self._within(i, math.ceil(0.5 * _SPREAD_M / _CELL_M))
+        return [int(j) for j in found if j != i]
+
+    def _within(self, i: int, reach: int) -> NDArray[np.int64]:
+        """Return up to `_AROUND` poses that are less than `reach` cells away, nearest first, then in their order."""
+        column, row = self._cell_of[i]
+        cells = itertools.product(range(column - reach, column + reach + 1), range(row - reach, row + reach + 1))
+        some = np.array(sorted(itertools.chain.from_iterable(self._members.get(cell, ()) for cell in cells)), np.int64)
+        away = np.hypot(*(self._poses[some, :2] - self._poses[i, :2]).T)
+        near = np.nonzero(away < reach * _CELL_M)[0]
+        return some[near[np.argsort(away[near], kind="stable")[:_AROUND]]]

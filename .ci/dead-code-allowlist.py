@@ -13,6 +13,8 @@ _.waits_code  # api: why a mission by the clock waits
 _.acknowledged_at  # api: since when somebody looks after an alert
 _.translation_deviation_m  # report: of a trajectory, in `map from-log --json`
 _.rotation_worst_deg
+_.off_m  # report: of scans on each other, in `bench mapping --json`
+_.off_deg
 _.after_input  # the agent's replay: where a recording and its replay differ
 _.control_p99_s  # messages: how regular the agent's loops are
 (_.request_time, _.available_floors, _.lift_time)  # messages: Open-RMF's, of a lift

@@ -240,6 +240,11 @@ def test_benchmark_of_mapping_measures_time_memory_and_errors_of_a_log(folder):
     assert 0.0 < found["seconds"] < 60.0
     assert 50 < found["rss_mb"] < 4000
     assert found["relations"]["1 m"]["translation_m"] < 0.03
+    assert found["scans_fit"]["matched"]["residual_m"] < 0.02
+    code, found = run("bench", "mapping", "--log", folder / "drive.jsonl.gz", "--scans", 400)
+    assert (code, found["log"]) == (0, "400-scans.jsonl")
+    assert 50 < found["scans"] < 150, "those between which the robot has moved"
+    assert found["relations"]["1 m"]["translation_m"] < 0.03
 
 
 def test_benchmark_of_mapping_says_where_recordings_were_looked_for(tmp_path, monkeypatch):

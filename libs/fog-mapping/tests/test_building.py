@@ -14,7 +14,7 @@ from fog_kernels.raycast import cast
 from fog_mapping.building import draw, find_trajectory
 from fog_mapping.loops import LoopSearch, _neighbours
 from fog_mapping.poses import Edge, between, compose, place
-from fog_mapping.relations import absolute_error, relation_errors
+from fog_mapping.relations import absolute_error, relation_errors, scans_fit
 from fog_mapping.scans import Scan, keep_moved, scan_of
 from fog_mapping.trajectory import _AROUND, _Cells, refuse_mirrored
 
@@ -258,6 +258,16 @@ def test_scan_that_shows_little_is_left_out_and_one_without_odometry_refused():
     assert scan_of(3, BEAMS, np.full(len(BEAMS), np.nan), (0.0, 0.0, 0.0), RANGE_M) is None
     with pytest.raises(ValueError, match="scan 3: the odometry must be x, y and theta, finite"):
         scan_of(3, BEAMS, np.full(len(BEAMS), 1.0), (0.0, math.nan, 0.0), RANGE_M)
+
+
+def test_scans_lie_on_each_other_best_where_they_were_taken_and_tell_how_far_off_a_reference_is():
+    scans, truth = FLOOR.drive(ROUND[:3], seed=1)
+    off = truth + np.random.default_rng(1).normal(0.0, (0.03, 0.03, 0.01), truth.shape)
+    true, wrong = scans_fit(scans, truth, off)
+    assert true.residual_m < 0.02 < wrong.residual_m
+    assert true.off_m < 0.015
+    assert 0.03 < wrong.off_m < 0.08
+    assert true.off_deg < 0.3 < wrong.off_deg
 
 
 def test_a_way_of_many_scans_between_joints_makes_as_uncertain_as_each_of_its_steps():

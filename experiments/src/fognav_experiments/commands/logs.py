@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path  # Typer reads annotations at run time
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -133,28 +134,43 @@ def bench_mapping(
     log_file: Annotated[
         Path | None, typer.Option("--log", metavar="LOG", help="Another log than that of the Intel Research Lab.")
     ] = None,
+    scans: Annotated[
+        int | None,
+        typer.Option("--scans", metavar="N", min=2, help="Drive the log's way in its map until there are N scans."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Make a map of a recorded floor: the time, the memory, and how far it is off the log's reference.
 
     The log is looked for in the folder that FOGNAV_DATA names. `seconds` run on the clock, from the log in memory to
-    the map; `cpu_seconds` are those of all cores; `rss_mb` is the most that the process had.
+    the map; `cpu_seconds` are those of all cores; `rss_mb` is the most that the process had. `scans_fit` tells how two
+    scans 1 m apart lie on each other by this trajectory and by the log's reference, which is a SLAM result itself. With
+    --scans the log is a simulated one, of a robot that drives the same way forth and back for hours.
     """
-    from fognav_experiments import machine  # noqa: PLC0415  # keeps the other commands fast
+    from fog_mapping.relations import scans_fit  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments import machine  # noqa: PLC0415  # same
     from fognav_experiments.lidar_logs import mapping  # noqa: PLC0415  # same
     from fognav_experiments.lidar_logs.logs import read_log  # noqa: PLC0415  # same
+    from fognav_experiments.lidar_logs.long_drive import write_long_drive  # noqa: PLC0415  # same
     from fognav_experiments.localization_trials import with_noise  # noqa: PLC0415  # same
 
     with exit_codes():
         file = log_file or recordings() / "lidar_logs" / INTEL
-        log = read_log(file)
         kernels.warm_cache(lambda text: console.print(text, markup=False))
+        log = read_log(file)
+        if scans is not None:
+            with TemporaryDirectory() as folder:
+                write_long_drive(log.scans, scans, file := Path(folder) / f"{scans}-scans.jsonl")
+                log = read_log(file)
         used = log.scans if log.odometry_measured else with_noise(log.scans, 1)
         started = time.monotonic()
         made = mapping.map_log(used, "matched", (), 0.05, 30.0)
         seconds = time.monotonic() - started
     found = made.figures()
     found |= {"seconds": round(seconds, 2), "cpu_seconds": found["seconds"], "loops": len(made.loops or ())}
+    if made.reference is not None and scans is None:
+        fits = scans_fit(mapping.scans_of(used, 30.0), made.poses, made.reference)
+        found["scans_fit"] = {name: fit._asdict() for name, fit in zip(("matched", "reference"), fits, strict=False)}
     if json:
         print_json({"bench": "mapping", "log": file.name, **found, **machine.describe()})
         return

@@ -342,6 +342,9 @@ def test_a_robot_without_free_and_seen_floor_around_it_does_not_drive_by_itself(
     assert plan.unfit(points) == ""
     near = np.concatenate((points, [[0.0, -0.5]]))
     assert "something stands 0.50 m from it, 90 degrees to the right: 0.65 m must be free" in plan.unfit(near)
+    begun = np.concatenate((points, [[0.0, -0.6]]))
+    assert plan.unfit(begun) != ""
+    assert plan.unfit(begun, -0.05) == "", "the wall that it came nearer to in a round"
     assert "in 18 of 36 directions only" in plan.unfit(points[points[:, 1] > 0.0])
     assert "in 0 of 36 directions only" in plan.unfit(points[:0])
     with pytest.raises(WrongUseError, match=r"too small .*: it needs --square 1.2 at least"):

@@ -169,18 +169,21 @@ class SquareDrive:
             "there. Choose a place with walls within its reach"
         )
 
-    def unfit(self, points: NDArray[np.float64]) -> str:
-        """Return why a robot that sees these points (n, 2; m, in its frame) must not begin; empty if it may."""
+    def unfit(self, points: NDArray[np.float64], spare: float = _FREE_M) -> str:
+        """Return why a robot that sees these points (n, 2; m, in its frame) must not begin; empty if it may.
+
+        spare: m, by how much what stands around it must be farther away than the square's side.
+        """
         if reason := self.unseen(points):
             return reason
         far, bearing = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
         others = far > self._config.radius
         nearest = int(np.argmin(np.where(others, far, np.inf)))
-        if far[nearest] < self._free + _FREE_M:
+        if far[nearest] < self._free + spare:
             side = math.degrees(float(bearing[nearest]))
             return (
                 f"something stands {far[nearest]:.2f} m from it, {abs(side):.0f} degrees to the "
-                f"{'left' if side >= 0.0 else 'right'}: {self._free + _FREE_M:.2f} m must be free all around"
+                f"{'left' if side >= 0.0 else 'right'}: {self._free + spare:.2f} m must be free all around"
             )
         return ""
 
@@ -280,7 +283,8 @@ def _rounds(robot: LocalRobot, heard: _Recorded, plan: SquareDrive, ends: Callab
             print_line(f"round {number} of {ROUNDS}: {told}")
             if known_well or ends() or number == ROUNDS:
                 return
-            if reason := plan.unfit(heard.view.points()):  # it stood a while, and may have looked finished
+            # It stood a while, and may have looked finished. It is some centimetres off: walls may be nearer now.
+            if reason := plan.unfit(heard.view.points(), -_FREE_M):
                 raise FailedError(f"the robot does not drive on by itself: {reason}")
             plan.again()
 

@@ -20,7 +20,7 @@ from fognav.robot_page.mounting import OwnReturns, changes, masked_sectors, miss
 from fognav.robot_page.view import RobotView
 from robot_agent.agent import local_link
 from robot_agent.agent.hand_driving import HandReply
-from robot_agent.calibration import Changed
+from robot_agent.calibrated import Changed
 from robot_agent.footprint import Footprint
 from robot_agent.guardian.link import BaseFeedback
 from robot_agent.hardware import BaseStatus, LaserScan, WheelOdometry

@@ -29,7 +29,8 @@ from fognav_experiments.bench.calibration import Body, driven, measure, random_b
 from robot_agent.agent import local_link
 from robot_agent.agent.hand_driving import HandReply, Steer, TakeOver
 from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, BaseReceived, Published, ScanReceived, Started
-from robot_agent.calibration import NAMES, Calibration, CalibrationError, Calibrator, Figure, changes
+from robot_agent.calibrated import NAMES, Calibration, Figure, changes
+from robot_agent.calibration import CalibrationError, Calibrator
 from robot_agent.hardware import WheelOdometry
 from robot_agent.scan_builder import Mounting
 
@@ -39,9 +40,9 @@ BACK = (-0.12, 0.0, 16.0)
 TOML = '[base]\ndriver = "roomba600"\n[base.options]\naxle_m = 0.235  # by a ruler\n[lidar]\ndriver = "rplidar-a1"\n'
 
 
-def calibrator_of(walk, body=None, seed=3) -> Calibrator:
+def calibrator_of(walk, body=None, seed=3, slip=0.01) -> Calibrator:
     rng, made = np.random.default_rng(seed), Calibrator()
-    for entry in recording(body or random_body(rng), rng, walk):
+    for entry in recording(body or random_body(rng), rng, walk, slip):
         made.take(entry)
     return made
 
@@ -73,6 +74,19 @@ def test_eight_bodies_up_to_15_percent_wrong_are_found_and_intervals_are_honest(
     assert max(found["worst"][name] for name in ("x", "y")) < 0.005
     assert found["worst"]["yaw"] < math.radians(0.3)
     assert 0.9 <= found["intervals_true"] <= 0.99
+
+
+@pytest.mark.drive
+def test_how_much_the_wheels_slip_is_told_as_the_noise_that_the_filter_counts_with_and_only_more_is_written():
+    body = Body(left=1.0, right=1.0, axle=1.0, x=0.04, y=-0.02, yaw=0.1, latency=0.0, mirrored=False)
+    slip, walk = 0.08, [(0.0, 0.0, 1.0), *[STRAIGHT, BACK, LEFT, RIGHT] * 3]
+    found = calibrator_of(walk, body, slip=slip).solve()
+    by_turn, by_way = 0.5 * slip**2, 2.0 * 0.1 * 0.12 * slip**2 / 0.235**2 / (2.0 * 0.1)
+    assert by_turn / 2 < found.noise[0] < 2 * by_turn
+    assert by_way / 2 < found.noise[1] < 2 * by_way
+    settings = parse_robot(f"{TOML}[odometry]\nalphas = [0.001, 0.05, 0.01, 0.05]\n", Path("robot.toml"), {}).settings
+    told = {c.setting: c.now for c in changes(found, config_of(body), settings, 0.072)}
+    assert told["odometry.alphas"] == [pytest.approx(found.noise[0], abs=1e-4), 0.05, 0.01, 0.05]
 
 
 @pytest.mark.drive

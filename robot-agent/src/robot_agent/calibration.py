@@ -19,6 +19,7 @@ from fog_mapping.poses import between, compose
 from fog_mapping.scans import Scan
 from fog_mapping.trajectory import independent
 from robot_agent.agent.recording.input_log import BaseReceived, ScanReceived, Started
+from robot_agent.calibrated import LEVEL, NAMES, Calibration, Figure, motion_noise
 from robot_agent.localization.odometry import wheel_travel
 
 if TYPE_CHECKING:
@@ -26,20 +27,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from fog_contracts.robot import RobotSettings
+    from robot_agent.calibrated import Alphas
     from robot_agent.config import AgentConfig
-    from robot_agent.hardware import DriveTrain
 
     _Track = tuple[NDArray[np.float64], NDArray[np.float64]]
     """Poses of odometry, shape (n, 3), and their times (s)."""
-
-NAMES: Final = ("left", "right", "axle", "x", "y", "yaw", "latency")
-"""What is found: each wheel's travel as a share of what its counter says, the axle (m), the lidar (m, m, rad), and how
-much older (s) scans are than the counters that arrive with them."""
-WANTED: Final = (0.003, 0.003, 0.003, 0.005, 0.005, math.radians(0.3), 0.02)
-"""Half widths of intervals that are good enough: shares, of the axle too, m, m, rad, s."""
-LEVEL: Final = 1.96
-"""Deviations of an interval, of 95 %."""
 
 _STEP_M: Final = 0.6
 _STEP_RAD: Final = 1.0
@@ -67,26 +59,6 @@ _STOOD_M: Final = 0.005
 
 class CalibrationError(ValueError):
     """What was recorded does not tell; the message names what is missing."""
-
-
-class Figure(NamedTuple):
-    """A value, and half of its interval of 95 %."""
-
-    value: float
-    half: float
-
-
-class Calibration(NamedTuple):
-    """What was found, by name (`NAMES`); whether the lidar's angles are mirrored, and what speaks for all this.
-
-    steps: pairs of scans that were used. residual_m, residual_rad: rms of what the wheels say against the scans.
-    """
-
-    figures: dict[str, Figure]
-    mirrored: bool
-    steps: int
-    residual_m: float
-    residual_rad: float
 
 
 class Driven(NamedTuple):
@@ -201,7 +173,7 @@ class Calibrator:
             raise CalibrationError(f"this can't be told yet: {'; '.join(missing)}")
         guess, mirrored = self.start, self._is_mirrored()
         steps: list[_Step] = []
-        found = guess, np.eye(7), 0.0, 0.0, 0
+        found = guess, np.eye(7), steps
         for number in range(_PASSES):
             steps = self._steps(guess, mirrored=mirrored, wide=number == 0)
             if len(steps) < _LEAST_STEPS:
@@ -213,10 +185,20 @@ class Calibrator:
                 guess = self._closed_form(steps, guess)
             found = self._fit(steps, guess)
             guess = found[0]
-        values, covariance, metres, radians, used = found
+        values, covariance, used = found
+        errors = self._residuals(used, values)
+        metres, radians = (float(np.sqrt((e**2).sum(axis=1).mean())) for e in (errors[:, :2], errors[:, 2:]))
         halves = LEVEL * np.sqrt(np.diag(covariance))
         figures = {name: Figure(float(v), float(h)) for name, v, h in zip(NAMES, values, halves, strict=True)}
-        return Calibration(figures, mirrored, used, metres, radians)
+        return Calibration(figures, mirrored, len(used), metres, radians, self._noise(steps, values))
+
+    def _noise(self, steps: Sequence[_Step], values: NDArray[np.float64]) -> Alphas:
+        """Return the noise of the wheels by all of the lidar's motions: those that fit worst are where wheels slip."""
+        assert self.config is not None
+        track, mount = self._track(values), values[3:6]
+        begins, ends = (self._at(track, np.array([getattr(step, name) for step in steps])) for name in ("begin", "end"))
+        off = compose(compose(mount, self._residuals(steps, values)), between(mount, np.zeros(3)))
+        return motion_noise(between(begins, ends), off, self.config.localization)
 
     def end_error(self, values: NDArray[np.float64], *, mirrored: bool) -> tuple[float, float, float]:
         """Return how far (m, rad) the wheels are off at the end of this drive by its scans, and how long (m) it is.
@@ -391,8 +373,8 @@ class Calibrator:
 
     def _fit(
         self, steps: Sequence[_Step], start: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float, int]:
-        """Return values (7,), covariance (7, 7), rms residuals (m, rad) and the number of steps, without the worst."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], list[_Step]]:
+        """Return values (7,), covariance (7, 7) and the steps that were used, without the worst."""
         values, used = start.copy(), list(steps)
         scales = np.array((1.0, 1.0, 1.0, 0.1, 0.1, 0.1, 0.05))
         normal = np.eye(7)
@@ -422,10 +404,7 @@ class Calibrator:
                     used = [step for step, kept in zip(used, keep, strict=True) if kept]
             elif np.abs(change / scales).max() < _TINY:
                 continue
-        errors = self._residuals(used, values)
-        covariance = np.asarray(np.linalg.inv(normal) * np.outer(scales, scales), np.float64)
-        metres = float(np.sqrt((errors[:, :2] ** 2).sum(axis=1).mean()))
-        return values, covariance, metres, float(np.sqrt((errors[:, 2] ** 2).mean())), len(used)
+        return values, np.asarray(np.linalg.inv(normal) * np.outer(scales, scales), np.float64), used
 
 
 def _far(one: NDArray[np.float64], other: NDArray[np.float64], share: float) -> bool:
@@ -450,77 +429,3 @@ def _matched(
     if np.linalg.eigvalsh(information)[0] < 1.0:
         return None
     return np.array(aligned.pose), information
-
-
-Setting = float | bool | list[list[float]]
-"""The value of a setting."""
-
-
-class Changed(NamedTuple):
-    """A setting by its dotted name, its value before and now; half: of the interval, None for a choice."""
-
-    setting: str
-    before: Setting
-    now: Setting
-    half: float | None
-
-
-def changes(found: Calibration, config: AgentConfig, settings: RobotSettings, diameter: float) -> list[Changed]:
-    """Return what a calibration changes in a robot's settings, whose wheels are this large (m)."""
-    left, right = found.figures["left"], found.figures["right"]
-    mean, half = 0.5 * (left.value + right.value), 0.5 * math.hypot(left.half, right.half)
-    ratio = right.value / left.value
-    lidar, latency = settings.lidar, found.figures["latency"]
-    told = [
-        Changed("base.options.wheel_diameter_m", diameter, round(diameter * mean, 6), diameter * half),
-        Changed("odometry.wheel_ratio", settings.odometry.wheel_ratio, round(ratio, 5), ratio * half),
-        Changed("base.options.axle_m", config.drive_train.axle_m, *_rounded(found.figures["axle"], 5)),
-        Changed("lidar.x_m", lidar.x_m, *_rounded(found.figures["x"], 4)),
-        Changed("lidar.y_m", lidar.y_m, *_rounded(found.figures["y"], 4)),
-        Changed("lidar.yaw_rad", lidar.yaw_rad, *_rounded(found.figures["yaw"], 4)),
-    ]
-    if found.mirrored:
-        told.append(Changed("lidar.mirrored", lidar.mirrored, not lidar.mirrored, None))
-    if abs(latency.value) > latency.half:
-        told.append(Changed("lidar.latency_s", lidar.latency_s, *_rounded(latency, 3)))
-        later = max(0.0, round(lidar.latency_s + latency.value, 3))
-        told[-1] = told[-1]._replace(now=later)
-    masks = [[*mask] for mask in lidar.masks]
-    if (turned := [_turned(mask, found, lidar.yaw_rad) for mask in masks]) != masks:
-        told.append(Changed("lidar.masks", masks, turned, None))
-    return told
-
-
-def _turned(mask: Sequence[float], found: Calibration, yaw: float) -> list[float]:
-    """Return a mask (rad, in the robot's frame) over the same samples, whose direction was `yaw` (rad) until now."""
-    ends = [end - yaw for end in mask]
-    if found.mirrored:
-        ends = [-ends[1], -ends[0]]
-    return [round(math.remainder(end + round(found.figures["yaw"].value, 4), math.tau), 4) for end in ends]
-
-
-def differing(config: AgentConfig, settings: RobotSettings, drive: DriveTrain) -> list[str]:
-    """Return which of the settings that a calibration corrects are others than those that a recording was made with.
-
-    drive: of the base by these settings.
-    """
-    lidar, used, recorded = settings.lidar, config.localization, config.drive_train
-    pairs = {
-        "base.options.wheel_diameter_m": (recorded.travel_wrap_m, drive.travel_wrap_m),
-        "base.options.axle_m": (recorded.axle_m, drive.axle_m),
-        "odometry.wheel_ratio": (recorded.wheel_ratio, settings.odometry.wheel_ratio),
-        "lidar.x_m": (used.lidar_x, lidar.x_m),
-        "lidar.y_m": (used.lidar_y, lidar.y_m),
-        "lidar.yaw_rad": (used.lidar_yaw, lidar.yaw_rad),
-        "lidar.mirrored": (used.lidar_mirrored, lidar.mirrored),
-        "lidar.latency_s": (used.lidar_latency, lidar.latency_s),
-    }
-    return [
-        name
-        for name, (was, now) in pairs.items()
-        if was is not None and not math.isclose(was, now, rel_tol=1e-6, abs_tol=1e-9)
-    ]
-
-
-def _rounded(figure: Figure, digits: int) -> tuple[float, float]:
-    return round(figure.value, digits), figure.half

@@ -20,16 +20,8 @@ from fognav.robot_page.recording_view import until_told
 from fognav.robot_page.view import LocalRobotErrors
 from robot_agent import registry
 from robot_agent.agent.recording.input_log import ENTRY_OF_TOPIC, TOPIC_OF_ENTRY, BaseReceived, ScanReceived, Started
-from robot_agent.calibration import (
-    NAMES,
-    WANTED,
-    Calibration,
-    CalibrationError,
-    Calibrator,
-    Changed,
-    changes,
-    differing,
-)
+from robot_agent.calibrated import NAMES, WANTED, Calibration, Changed, changes, differing
+from robot_agent.calibration import CalibrationError, Calibrator
 from robot_agent.local_client import LocalRobot
 
 if TYPE_CHECKING:
@@ -231,6 +223,7 @@ def tell(found: Calibration, changed: list[Changed], accepted: dict[str, float],
         half = "" if change.half is None else f" +- {change.half:.5f}"
         print_answer(f"{change.setting:32} {change.before!s:>10} -> {change.now}{half}")
     print_answer(f"by {found.steps} pairs of scans; rms {1000 * found.residual_m:.1f} mm, {found.residual_rad:.4f} rad")
+    print_answer(f"noise of the wheels, as odometry.alphas: {', '.join(f'{share:.5f}' for share in found.noise)}")
     for name, value in accepted.items():
         print_answer(f"{name:32} {value}")
     if written:
@@ -261,6 +254,7 @@ def as_json(found: Calibration, changed: list[Changed], accepted: dict[str, floa
         "steps": found.steps,
         "residual_m": round(found.residual_m, 4),
         "residual_rad": round(found.residual_rad, 5),
+        "alphas": [round(share, 6) for share in found.noise],
         "changes": {change.setting: [change.before, change.now] for change in changed},
         **accepted,
     }

@@ -15,7 +15,8 @@ import numpy as np
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
 from robot_agent.agent.recording.input_log import LOG_KEY, BaseReceived, ScanReceived, Started
-from robot_agent.calibration import NAMES, Calibrator
+from robot_agent.calibrated import NAMES
+from robot_agent.calibration import Calibrator
 from robot_agent.config import agent_config
 from robot_agent.guardian.link import BaseFeedback
 from robot_agent.hardware import BaseStatus, DriveTrain, LaserScan, LidarTraits, WheelOdometry
@@ -34,6 +35,7 @@ _COUNTS: Final = 1 << 16
 _DIAMETER_M: Final = 0.072
 _AXLE_M: Final = 0.235
 _LAG_S: Final = 0.1
+_SLIP: Final = 0.01
 _WALK: Final[Sequence[tuple[float, float, float]]] = (
     (0.0, 0.0, 1.0), (0.12, 0.0, 8.0), (0.0, 0.5, 15.0), (-0.12, 0.0, 8.0), (0.0, -0.5, 15.0), (0.12, 0.4, 16.0),
     (0.12, -0.4, 16.0), (-0.1, 0.3, 12.0), (0.0, 0.6, 12.0), (0.12, 0.0, 8.0), (0.0, -0.6, 12.0), (-0.12, 0.0, 8.0),
@@ -72,16 +74,16 @@ def random_body(rng: np.random.Generator) -> Body:
 
 
 def recording(
-    body: Body, rng: np.random.Generator, walk: Sequence[tuple[float, float, float]] = _WALK
+    body: Body, rng: np.random.Generator, walk: Sequence[tuple[float, float, float]] = _WALK, slip: float = _SLIP
 ) -> Iterator[Any]:
-    """Yield the entries of a drive of this body in a room of its own."""
+    """Yield the entries of a drive of this body in a room of its own; its wheels slip as for `driven`."""
     lidar = LidarTraits(scan_period_s=_SCAN_S, range_min_m=0.15, range_max_m=12.0)
     wrap = _COUNTS * math.pi * _DIAMETER_M / _TICKS
     drive = DriveTrain(axle_m=_AXLE_M, wheel_speed_max_m_s=0.5, travel_wrap_m=wrap)
     site = RobotSite(id="r1", start=Pose(x=0.0, y=0.0, theta=0.0), radius=0.17)
     yield Started(config=agent_config("r1", LOG_KEY, drive, lidar, site, boot="b"), seed=0)
     walls = _room(rng)
-    poses, ticks = driven(body, rng, walk)
+    poses, ticks = driven(body, rng, walk, slip)
     stamps = np.arange(len(poses), dtype=np.float64) * _DT
     per_tick = math.pi * _DIAMETER_M / _TICKS
     due, scan_at, number, seq = 0.0, 0.3, 0, 0
@@ -115,9 +117,12 @@ def _room(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def driven(
-    body: Body, rng: np.random.Generator, walk: Sequence[tuple[float, float, float]]
+    body: Body, rng: np.random.Generator, walk: Sequence[tuple[float, float, float]], slip: float = _SLIP
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the body's poses (n, 3; m, m, rad) and its counters (n, 2), every 5 ms of a walk (m/s, rad/s, s)."""
+    """Return the body's poses (n, 3; m, m, rad) and its counters (n, 2), every 5 ms of a walk (m/s, rad/s, s).
+
+    slip: deviation of the share by which each wheel rolls more or less than it counts, anew every 0.1 s.
+    """
     commands = np.concatenate([np.tile((v, w), (round(seconds / _DT), 1)) for v, w, seconds in walk])
     asked = np.column_stack(
         (commands[:, 0] - commands[:, 1] * _AXLE_M / 2, commands[:, 0] + commands[:, 1] * _AXLE_M / 2)
@@ -129,8 +134,8 @@ def driven(
         speeds[step] = now
     rolled = np.cumsum(speeds, axis=0) * _DT  # by the firmware's own belief
     ticks = np.floor(rolled / (math.pi * _DIAMETER_M / _TICKS) + rng.uniform(0.0, 1.0, 2)).astype(np.int64)
-    slip = 1.0 + np.repeat(0.01 * rng.standard_normal((len(speeds) // 20 + 1, 2)), 20, axis=0)[: len(speeds)]
-    travel = speeds * _DT * (body.left, body.right) * slip
+    rolls = 1.0 + np.repeat(slip * rng.standard_normal((len(speeds) // 20 + 1, 2)), 20, axis=0)[: len(speeds)]
+    travel = speeds * _DT * (body.left, body.right) * rolls
     turned = (travel[:, 1] - travel[:, 0]) / (body.axle * _AXLE_M)
     theta = np.cumsum(turned)
     middle, ahead = theta - 0.5 * turned, travel.mean(axis=1)

@@ -105,7 +105,7 @@ class StackConfig:
     which the ports do not count; `extra` contains further FOGNAV_ settings for every process. With `users` the servers
     encrypt, and admit only those users; without, everybody on this machine. The servers named in `embedded` are Python
     packages (`servers.STAND_INS`). `planners` are the planners' programs, each with FOGNAV_ settings of its own: more
-    than one take turns.
+    than one take turns. `console` has further settings of the console-service.
     """
 
     site_dir: Path
@@ -119,6 +119,7 @@ class StackConfig:
     users: StackUsers | None = None
     embedded: frozenset[str] = frozenset()
     planners: Mapping[str, Mapping[str, str]] = field(default_factory=lambda: {PLANNER: {}})
+    console: Mapping[str, str] = field(default_factory=dict)
 
 
 def _new_folder() -> Path:
@@ -251,7 +252,7 @@ class Stack:
         key = {"OPERATOR_KEY_FILE": str(self.key_file)}
         taken = {self.mqtt_port, self.redis_port, self.zenoh_port}
         services: dict[str, Mapping[str, str]] = {name: {} for name in SERVICES}
-        services.update(self.config.planners)
+        services.update({**self.config.planners, CONSOLE: self.config.console})
         http = {name: net.free_port(taken) for name in services}  # the console-service must know the others'
         behind = {setting: f"http://{net.LOOPBACK}:{http[name]}" for name, setting in URLS.items()}
         for name, further in services.items():

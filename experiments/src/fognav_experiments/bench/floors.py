@@ -11,18 +11,20 @@ from __future__ import annotations
 import asyncio
 import itertools
 import secrets
+import shutil
 import sys
 import threading
+import time
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import msgspec
 import numpy as np
 import psutil
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import MapDelta, NodeReading, Pose, RobotGoal, RobotPath, RobotRelease
+from fog_contracts.messages import MapDelta, NodeReading, Pose, RobotGoal, RobotPath, RobotRelease, SimTruth
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.configuration.site import load_site
 from fog_runtime.credentials import Credentials
@@ -30,9 +32,9 @@ from fog_runtime.transports.mqtt_edge import MqttEdge
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.output import FailedError
-from fognav.programs import PLANNER
+from fognav.programs import CONSOLE, PLANNER
 from fognav.stack import Stack, StackConfig, StackUsers
-from fognav_experiments.bench.common import SITE, in_background
+from fognav_experiments.bench.common import SITE, ask, in_background
 from fognav_experiments.bench.pipeline import BENCH, write_nodes
 from fognav_experiments.bench.room import STATE_STEPS, STEP_S, BlindRobot, ChangingMap
 
@@ -49,6 +51,7 @@ _HAZARD_EVERY_S: Final = 30.0
 _HAZARD_LASTS_S: Final = 10.0
 _READING_S: Final = 0.1
 _TURNS: Final = 10
+_DRIVES_M_S: Final = 0.1
 MB: Final = 1e6
 
 
@@ -195,6 +198,93 @@ async def _ended(player: Process) -> dict[str, Any]:
     if player.returncode != 0:
         raise FailedError(f"a player of robots and nodes failed: {err.decode(errors='replace').strip()[-800:]}")
     return msgspec.json.decode(out.splitlines()[-1], type=dict[str, Any])
+
+
+async def stops(sites: Path, folder: Path, trials: int, on_step: Callable[[str], object]) -> dict[str, Any]:
+    """Return how long (ms) a press that stops all floors takes, from the request to wheels that stand on both.
+
+    Each floor has a whole simulated robot. Wheels are looked at ten times a second: a time is up to 100 ms too long.
+    `folder` is empty. Raises `FailedError`.
+    """
+    there = folder / "upstairs"
+    shutil.copytree(sites / "estig", there)
+    text = (there / "site.toml").read_text("utf-8")
+    (there / "site.toml").write_text(text.replace('id = "estig"', 'id = "upstairs"', 1), "utf-8")
+    async with AsyncExitStack() as contexts:
+        on_step("starting two floors, each with a robot")
+        second = await contexts.enter_async_context(Stack(_with_robot(there)))
+        await second.start(_READY_S)
+        listed = folder / "floors.toml"
+        (folder / "upstairs.toml").write_text(f'user = "bench"\ntoken = "{second.token}"\n', "utf-8")
+        address = f"http://{net.LOOPBACK}:{second.port(CONSOLE)}"
+        listed.write_text(f'[floors.upstairs]\naddress = "{address}"\ncredentials = "upstairs.toml"\n', "utf-8")
+        first = await contexts.enter_async_context(Stack(_with_robot(sites / "estig", {"FLOORS_FILE": str(listed)})))
+        await first.start(_READY_S)
+        driven = [
+            await contexts.enter_async_context(_Driven.of(stack, id_))
+            for stack, id_ in ((first, "estig"), (second, "upstairs"))
+        ]
+        times = []
+        for trial in range(trials):
+            for each in driven:
+                await each.drive("b")
+            begun = SystemClock().stamp()
+            pressed = await ask(first, CONSOLE, "POST", "/api/v1/floors/stop", {})
+            if not isinstance(pressed.body, list) or not all(floor["acknowledged"] for floor in pressed.body):
+                raise FailedError(f"not all floors acknowledged the stop: {pressed.reason or pressed.body}")
+            times.append(1000.0 * max([await each.stood_at() - begun for each in driven]))
+            on_step(f"press {trial + 1} of {trials}: {times[-1]:.0f} ms")
+    return {
+        "presses": trials,
+        **{f"stopped_p{p}_ms": round(float(np.percentile(times, p)), 1) for p in (50, 99)},
+        "stopped_max_ms": round(max(times), 1),
+    }
+
+
+def _with_robot(site: Path, console: Mapping[str, str] | None = None) -> StackConfig:
+    return StackConfig(site_dir=site, robot="r1", extra={"HAZARDS_WAIT_S": "0"}, console=console or {})
+
+
+class _Driven:
+    """A floor's robot, and whether its wheels turn."""
+
+    def __init__(self, stack: Stack) -> None:
+        self._stack = stack
+        self._truth: SimTruth | None = None
+
+    @classmethod
+    @asynccontextmanager
+    async def of(cls, stack: Stack, site: str) -> AsyncIterator[Self]:
+        """Watch the robot of a floor."""
+        made, at = cls(stack), [stack.zenoh_endpoint]
+        async with ZenohEdge.open(connect=at, clock=SystemClock(), role="sim", id="bench", site=site) as edge:
+            edge.subscribe(ch.SIM_TRUTH, SimTruth, lambda _ids, truth: made._see(truth))
+            yield made
+
+    def _see(self, truth: SimTruth) -> None:
+        self._truth = truth
+
+    async def drive(self, place: str) -> None:
+        """Send it to a place, and wait until it drives; raises `FailedError`."""
+        await self._ask("PUT", "/api/v1/robots/r1/goal", {"place": place})
+        deadline = time.monotonic() + _READY_S
+        while (truth := self._truth) is None or min(truth.left, truth.right) < _DRIVES_M_S:
+            if time.monotonic() > deadline:
+                raise FailedError(f"the robot does not drive to {place} within {_READY_S:.0f} s")
+            await self._ask("POST", "/api/v1/robots/r1/commands", {"kind": "enable"})
+            await asyncio.sleep(0.5)
+
+    async def _ask(self, method: str, path: str, body: object) -> None:
+        await ask(self._stack, PLANNER, method, path, body)
+
+    async def stood_at(self) -> float:
+        """Return when its wheels stood (s since 1970), as soon as they do; raises `FailedError`."""
+        deadline = time.monotonic() + 10.0
+        while (truth := self._truth) is None or (truth.left, truth.right) != (0.0, 0.0):
+            if time.monotonic() > deadline:
+                raise FailedError("a robot drives on 10 s after its stop")
+            await asyncio.sleep(0.005)
+        return truth.stamp
 
 
 class _Player:

@@ -115,25 +115,33 @@ def floor_command(
 def floors_command(
     *,
     counts: Annotated[
-        list[int], typer.Option("--floors", metavar="N", min=1, max=50, help="How many; may be repeated.")
-    ],
+        list[int] | None, typer.Option("--floors", metavar="N", min=1, max=50, help="How many; may be repeated.")
+    ] = None,
     robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=20, help="Of each floor.")] = 5,
     nodes: Annotated[int, typer.Option("--nodes", metavar="N", min=1, max=200, help="Of each floor.")] = 25,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=5.0, help="How long to measure.")] = 60.0,
+    stops: Annotated[
+        int, typer.Option("--stops", metavar="N", min=0, max=50, help="Press the stop of all floors so often, instead.")
+    ] = 0,
     json: JsonOption = False,
 ) -> None:
     """Measure what floors cost this machine, each with servers and services of its own.
 
     Robots and nodes are played by one process a floor, which does not count. Memory (MB) and processor time (% of a
     core) are those of all floors together, by program; the model is the line through the least and the largest count.
+    With --stops two floors have a whole simulated robot each, which drive; a time runs from the request to the
+    console-service of one floor until the wheels of both robots stand.
     """
     from fognav_experiments.bench import floors  # noqa: PLC0415  # keeps the other commands fast
 
     kernels.warm_cache(print_line)
     with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
         traffic = floors.Traffic(robots, nodes)
-        figures = asyncio.run(floors.measure(Path(folder), counts, traffic, seconds, print_line))
-    asked = {"robots": robots, "nodes": nodes, "seconds": seconds}
+        if stops:
+            figures = asyncio.run(floors.stops(checkout.root() / "sites", Path(folder), stops, print_line))
+        else:
+            figures = asyncio.run(floors.measure(Path(folder), counts or [1, 2], traffic, seconds, print_line))
+    asked = {"stops": stops} if stops else {"robots": robots, "nodes": nodes, "seconds": seconds}
     _show("floors", asked, figures, json=json)
 
 

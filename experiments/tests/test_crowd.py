@@ -13,7 +13,8 @@ import ring_site as ring
 
 from fog_contracts.messages import SimObstacle
 from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec
-from fognav_experiments.comparison.people import people_drive, people_tasks, publish
+from fognav_experiments.comparison.people import PeopleDrive, people_drive, people_tasks, publish
+from fognav_experiments.comparison.records import DriveFiles
 
 pytestmark = pytest.mark.timeout(900)
 SEEDS = int(os.environ.get("FOGNAV_CROWD_SEEDS", "2"))
@@ -164,6 +165,12 @@ def test_a_drive_among_people_tells_what_nodes_reported_of_them_and_what_they_co
     assert found.passed >= found.passed_reported > 0
     assert found.missed_seen == 0, "who stands in a cone is seen"
     assert alone.episodes.blocks == 0, "without nodes nobody reports anything"
+    files, others = (DriveFiles(tmp_path / name, PeopleDrive) for name in "ab")
+    for drive in drives:
+        files.write(drive)
+    (tmp_path / "all").write_bytes(files.pack({}))
+    others.unpack(tmp_path / "all")
+    assert others.read() == drives
     free = msgspec.structs.replace(among, people=0, distance_m=among.distance_m - 1.5)
     page = publish([free, *drives], "fognav experiment people", {}, tmp_path)[0].read_text("utf-8")
     assert "| 4 | fog | 1, 1 | 1.50 | 0.00 |" in page

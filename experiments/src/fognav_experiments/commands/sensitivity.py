@@ -133,9 +133,11 @@ def people_command(
     """Drive the first route among walking people, led by the fog and without it.
 
     The report tells which blocks only passers-by made, who stood before a node unseen, and what people cost a robot.
-    Drives that were killed go on when the command is repeated, and more --runs add to those that are there.
+    Drives that were killed go on when the command is repeated, also on another machine with the archive alone,
+    people.jsonl.xz; more --runs add to those that are there.
     """
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fog_runtime.files import SHARED, atomic_write  # noqa: PLC0415  # same
     from fognav_experiments.comparison import people as among  # noqa: PLC0415  # same
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import DriveFiles, Folder, FolderError  # noqa: PLC0415  # same
@@ -150,6 +152,7 @@ def people_command(
             folder = Folder(out)
             folder.begin(runner.new(loaded, place, seed), measured_on())
             files = DriveFiles(folder.path / "people", among.PeopleDrive)
+            files.unpack(folder.path / among.ARCHIVE)
         except (SiteError, runner.SpecError, FolderError) as error:
             raise WrongUseError(str(error)) from error
         prepare()
@@ -157,7 +160,9 @@ def people_command(
         drives = among.people_drives(loaded, asked, files, jobs or os.cpu_count() or 1, checkout.revision())
         failed = show(names, files, drives)
         found = [drive for drive in files.read() if drive.name in names]
-        for file in among.publish(found, command, folder.description()["measured_on"], folder.path):
+        measured = folder.description()["measured_on"]
+        atomic_write(folder.path / among.ARCHIVE, files.pack({"measured_on": measured}), mode=SHARED)
+        for file in among.publish(found, command, measured, folder.path):
             print_line(str(file))
     if failed:
         raise typer.Exit(NOT_TRUE)

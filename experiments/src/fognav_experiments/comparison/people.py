@@ -6,7 +6,6 @@ its own, in lockstep. People are the same at the start, and then react to the ro
 
 from __future__ import annotations
 
-import lzma
 import math
 from collections import Counter
 from dataclasses import dataclass
@@ -353,6 +352,7 @@ def _finite(value: float) -> float | None:
 
 
 ARCHIVE: Final = "people.jsonl.xz"
+"""All records: drives go on from it."""
 _WORDS: Final = """\
 A robot drives from A to B among people, who walk by the social-force model of Helbing and Molnár \
 (*Physical Review E* 51, 4282, 1995) with its parameters: {speed} ± {spread} m/s (at most 1.3 times as fast as \
@@ -362,24 +362,24 @@ rest is our own: people go from anywhere on the floor to anywhere, stand there f
 way to nobody then; who walks makes room for the robot as for a person, and comes no nearer than {near} m by himself. \
 They are round, 0.4 m wide, and echo as the simulator's boxes do. Each run draws others, the same in both setups. \
 `fog` is led by the fog; `lean`, the control, drives on its own at the same rates. In `fog` the planner has seen no \
-block before, so that it sends the robot round. After {egress:g} s in an area that became blocked round the robot an \
-operator lets it out (*let out*)."""
+block before, so that it sends the robot round. *Operator* counts commands after the first enable; after {egress:g} s \
+in an area that stays blocked round the robot one is to let it out."""
 _OF_NODES: Final = """\
 *By passers-by*: blocks during which nobody stood in the area. *Missed*: who stood in a watched area for more than \
 {missed:g} s while it was never blocked; in brackets those of them who stood in a cone. *More* is against the same \
 drive without people. *Stops* are protective stops, *holds* those on the way. *Closest* is the least distance between \
 the robot's rim and a person in a drive while the robot moved: median, least and most."""
 _HEADER: Final = (
-    "people", "setup", "drives, arrived", "m more", "s more", "s stood", "stops", "holds", "let out", "closest, m",
-    "contacts", "blocks", "by passers-by", "stood in areas", "missed (in cones)",
+    "people", "setup", "drives, arrived", "m more", "s more", "s stood", "stops", "holds", "operator", "closest, m",
+    "contacts", "blocks", "by passers-by", "walked through cones (reported)", "stood in areas (in cones)",
+    "missed (in cones)",
 )  # fmt: skip
 
 
 def publish(drives: Sequence[PeopleDrive], command: str, measured_on: Mapping[str, Any], target: Path) -> list[Path]:
-    """Write page, figure and archive of all records into a folder; return the files."""
+    """Write page and figure into a folder; return the files."""
     counts = sorted({drive.people for drive in drives})
-    mean, spread_m_s = SPEED_M_S
-    words = _WORDS.format(speed=mean, spread=spread_m_s, stands=STANDS_S, near=FROM_ROBOT_M, egress=EGRESS_S)
+    words = _WORDS.format(speed=SPEED_M_S[0], spread=SPEED_M_S[1], stands=STANDS_S, near=FROM_ROBOT_M, egress=EGRESS_S)
     seconds: dict[str, list[Estimate | None]] = {
         setup: [_seconds(_cell(drives, count, setup)) for count in counts] for setup in SETUPS
     }
@@ -402,9 +402,7 @@ def publish(drives: Sequence[PeopleDrive], command: str, measured_on: Mapping[st
     commits = Counter(drive.commit for drive in drives)
     blocks.append(Paragraph(f"Drives by commit: {', '.join(f'{n} at {commit}' for commit, n in commits.items())}."))
     blocks.append(Table(["measured on", ""], [[name, str(value)] for name, value in flat(measured_on)]))
-    lines = [msgspec.json.encode({"measured_on": measured_on}), *map(msgspec.json.encode, drives)]
-    packed = lzma.compress(b"\n".join(lines) + b"\n", check=lzma.CHECK_SHA256, preset=9 | lzma.PRESET_EXTREME)
-    files = {"README.md": to_markdown(blocks).encode(), picture.file: picture.svg.encode(), ARCHIVE: packed}
+    files = {"README.md": to_markdown(blocks).encode(), picture.file: picture.svg.encode()}
     for name, content in files.items():
         atomic_write(target / name, content, mode=SHARED)
     return [target / name for name in files]
@@ -426,16 +424,16 @@ def _row(drives: Sequence[PeopleDrive], count: int, setup: Setup) -> list[str]:
         return []
     free = {drive.run: drive for drive in _cell(drives, 0, setup) if drive.success}
     pairs = [(drive, free[drive.run]) for drive in cell if drive.success and drive.run in free]
-    runs = [drive.run for drive, _ in pairs]
     metres = [drive.distance_m - empty.distance_m for drive, empty in pairs]
     seconds = [(drive.time_s or 0.0) - (empty.time_s or 0.0) for drive, empty in pairs]
-    more = [told(values, runs) if count and pairs else "-" for values in (metres, seconds)]
+    more = [told(values, [drive.run for drive, _ in pairs]) if count and pairs else "-" for values in (metres, seconds)]
     closest = [drive.closest_moving_m for drive in cell if drive.closest_moving_m is not None]
     of = [drive.episodes for drive in cell]
     nodes = [
         str(sum(each.blocks for each in of)),
         str(sum(each.passing + each.empty for each in of)),
-        str(sum(each.stood for each in of)),
+        f"{sum(each.passed for each in of)} ({sum(each.passed_reported for each in of)})",
+        f"{sum(each.stood for each in of)} ({sum(each.stood_seen for each in of)})",
         f"{sum(each.missed for each in of)} ({sum(each.missed_seen for each in of)})",
     ]
     return [
@@ -443,7 +441,7 @@ def _row(drives: Sequence[PeopleDrive], count: int, setup: Setup) -> list[str]:
         f"{np.mean([drive.stood_s for drive in cell]):.1f}",
         str(sum(drive.modes.get("PROTECTIVE_STOP", 0) for drive in cell)),
         str(sum(drive.modes.get("HOLD", 0) for drive in cell)),
-        str(sum(drive.egresses for drive in cell)),
+        str(sum(drive.operator_commands - 1 + drive.egresses for drive in cell)),
         spread(closest) if closest else "-",
         str(sum(drive.contacts for drive in cell)),
         *(nodes if setup not in ALONE else ["-"] * len(nodes)),

@@ -177,6 +177,22 @@ class DriveFiles(Generic[N]):
                 raise FolderError(f"{file} can't be read: {error}. Remove it, and run the experiment again") from error
         return records
 
+    def pack(self, head: Mapping[str, Any]) -> bytes:
+        """Return all records as an archive of one kind, whose first line says what they were measured on."""
+        lines = [msgspec.json.encode(head), *map(msgspec.json.encode, self.read())]
+        return lzma.compress(b"\n".join(lines) + b"\n", check=lzma.CHECK_SHA256, preset=9 | lzma.PRESET_EXTREME)
+
+    def unpack(self, file: Path) -> None:
+        """Add the records of such an archive that are not here; without one there are none. Raises `FolderError`."""
+        try:
+            lines = _decompressed(file).splitlines()[1:] if file.exists() else []
+            records = [msgspec.json.decode(line, type=self._kind) for line in lines]
+        except (OSError, EOFError, lzma.LZMAError, msgspec.DecodeError, ValueError) as error:
+            raise _damaged(file, error) from error
+        for record in records:
+            if not self.has(record.name):
+                self.write(record)
+
     def _file(self, name: str) -> Path:
         return self.path / f"{name}.json"
 

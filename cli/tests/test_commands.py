@@ -150,6 +150,11 @@ def test_wrong_use_exits_with_code_2(arguments: list[str]) -> None:
     assert runner.invoke(app, arguments).exit_code == 2
 
 
+def test_check_of_a_site_names_areas_of_which_their_nodes_see_little() -> None:
+    shown = " ".join(runner.invoke(app, ["site", "check", "estig"]).output.split())
+    assert "areas of which their nodes see little: z1 38%" in shown
+
+
 def test_check_of_an_invalid_site_exits_with_code_1(tmp_path: Path) -> None:
     (tmp_path / "site.toml").write_text("id = 3\n")
     done = runner.invoke(app, ["site", "check", str(tmp_path), "--json"])

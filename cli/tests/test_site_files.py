@@ -23,7 +23,7 @@ from fog_kernels.sonar import classify, default_config
 from fog_runtime.configuration.maps import load_map, save_map
 from fog_runtime.configuration.site import load_site
 from fognav.output import WrongUseError
-from fognav.site_files import check_site, identifier, new_site, to_toml
+from fognav.site_files import check_site, identifier, new_site, seen_shares, to_toml
 from fognav.site_proposal import NoSiteError, propose
 from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import draw_hazard
@@ -80,7 +80,7 @@ def test_proposed_site_has_a_path_and_a_detour_around_each_area(seed: int) -> No
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_nodes_are_on_a_wall_and_their_limits_end_before_the_opposite_wall(seed: int) -> None:
+def test_nodes_see_their_areas_from_a_wall_and_their_limits_end_before_the_opposite_one(seed: int) -> None:
     geometry, cells = ring_of_corridors()
     site = propose("ring", "map.yaml", geometry, cells, seed).site
     walls = (cells == 254).astype(np.uint8)
@@ -95,6 +95,7 @@ def test_nodes_are_on_a_wall_and_their_limits_end_before_the_opposite_wall(seed:
             cone = node.theta + sonar.angle + np.linspace(-0.13, 0.13, 9)
             echoes = cast(walls, RESOLUTION, geometry.origin_x, geometry.origin_y, node.x, node.y, cone, 9.0)
             assert sonar.range_limit < echoes.min()
+    assert min(seen_shares(site, StaticMap(geometry, cells)).values()) > 0.8
 
 
 def random_floor(seed: int) -> tuple[GridGeometry, NDArray[np.uint8]]:

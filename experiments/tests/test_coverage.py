@@ -9,13 +9,13 @@ import programs
 import pytest
 from PIL import Image
 
-from fog_contracts.cones import SONAR_HALF_CONE
+from fog_contracts.cones import SEEN_BESIDE_M, SONAR_HALF_CONE
 from fog_contracts.messages import Place, SimObstacle
 from fog_contracts.site import Site
 from fog_kernels.sonar import classify, default_config
 from fog_runtime.configuration.maps import save_map
 from fog_runtime.configuration.site import LoadedSite, load_site
-from fognav_experiments.coverage import OBSTACLE_RADIUS_M, Coverage, coverage
+from fognav_experiments.coverage import Coverage, coverage
 from fognav_sim.floor import Floor
 from fognav_sim.sensors import Noise, Robot, Sonars
 
@@ -39,7 +39,7 @@ def state_with_a_person(estig: LoadedSite, node, x: float, y: float) -> str:
     """What the simulated node says when a person stands at a point."""
     floor = Floor(estig.map.geometry, estig.map.cells)
     ring = [
-        (x + OBSTACLE_RADIUS_M * math.cos(a), y + OBSTACLE_RADIUS_M * math.sin(a))
+        (x + SEEN_BESIDE_M * math.cos(a), y + SEEN_BESIDE_M * math.sin(a))
         for a in np.linspace(0.0, math.tau, 16, endpoint=False)
     ]
     floor.place(SimObstacle(id="person", polygon=ring, height=1.7))
@@ -55,7 +55,7 @@ def test_simulated_node_reports_a_person_on_the_axis_of_a_cone_and_not_one_besid
     for distance in (0.8, sonar.range_limit - 0.1):
         x, y = node.x + distance * math.cos(axis), node.y + distance * math.sin(axis)
         assert state_with_a_person(estig, node, x, y) == "blocked"
-    beside = node.theta + sonar.angle - SONAR_HALF_CONE - math.asin(OBSTACLE_RADIUS_M / 1.2) - 0.15
+    beside = node.theta + sonar.angle - SONAR_HALF_CONE - math.asin(SEEN_BESIDE_M / 1.2) - 0.15
     x, y = node.x + 1.2 * math.cos(beside), node.y + 1.2 * math.sin(beside)
     assert state_with_a_person(estig, node, x, y) == "clear"
     assert 0.2 < next(area for area in found.areas if area.area == "z4").share < 0.6

@@ -49,7 +49,7 @@ def rest_routes() -> dict[str, OpenApi]:
     clock, health, tokens = SystemClock(), Health(), Tokens()
     service = unused()
     return {
-        "hazard-aggregator": make_aggregator(service, loaded.map.geometry, clock, health, tokens).openapi(),
+        "hazard-aggregator": make_aggregator(service, loaded.map, clock, health, tokens).openapi(),
         "map-service": make_map(service, loaded.site, clock, health, tokens).openapi(),
         "planner": make_planner(service, loaded.site, health, tokens).openapi(),
         "console-service": make_console(service, health, tokens).openapi(),

@@ -6,6 +6,8 @@ import tomllib
 from pathlib import Path
 from typing import Any, Final
 
+from fog_contracts.cones import seen_share
+from fog_contracts.grid import StaticMap
 from fog_contracts.messages import Place
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, RobotSite, Site
 from fog_runtime.configuration.maps import MapFileError, load_map, read_provenance, save_map
@@ -296,7 +298,7 @@ def new_site(map_file: Path, out: Path, seed: int, *, whole_floor: bool = False)
     }
 
 
-def check_site(folder: Path) -> dict[str, object]:
+def check_site(folder: Path) -> dict[str, Any]:
     """Return the contents of a site, or the problem with it."""
     try:
         loaded = load_site(folder)
@@ -313,7 +315,18 @@ def check_site(folder: Path) -> dict[str, object]:
         "markers": len(site.markers),
         "demo": site.demo is not None,
         "unbounded_nodes": [node.id for node in site.nodes if any(each.range_max is None for each in node.sonars)],
+        "seen_shares": seen_shares(site, loaded.map),
         "areas_never_half_free": [area.id for area in site.areas if area.free_width and not _shows_free(site, area.id)],
+    }
+
+
+def seen_shares(site: Site, static: StaticMap) -> dict[str, float]:
+    """Return on which share of its floor (0 to 1) each area's nodes would notice something; areas without any lack."""
+    watched = {node.area for node in site.nodes}
+    return {
+        area.id: round(seen_share(area.polygon, [node for node in site.nodes if node.area == area.id], static), 3)
+        for area in site.areas
+        if area.id in watched
     }
 
 

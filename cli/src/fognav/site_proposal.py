@@ -28,7 +28,7 @@ from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_kernels.sonar import classify, default_config
-from fognav.nodes.placing import bounded, heard
+from fognav.nodes.placing import ANGLES, bounded, heard
 from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.floor import Floor
 
@@ -40,8 +40,9 @@ _ENDS_M: Final = (8.0, 3.0)
 _SCALES: Final = (1.0, 0.5, 0.25)
 """Where no path is as long, these shares of the distances do: a flat has no corridor of 15 m."""
 _CORRIDOR_M: Final = (0.9, 4.2)
-_AREA_LENGTH_M: Final = 2.4
-_SONAR_ANGLES: Final = (-0.13, 0.13)
+_EVEN_M: Final = 2.4
+"""So far along a corridor its walls must be even where an area is proposed."""
+_SHORTEST_M: Final = 0.8
 _SONAR_MAX_M: Final = 3.8
 """A little less than the sonar's specified range (4 m): the opposite wall must echo reliably."""
 _WALL_MARGIN_M: Final = 0.35
@@ -346,23 +347,25 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
         across, near, far = across + math.pi, far, near
     # A different width half an area ahead or behind means a door or a corner.
     dx, dy = math.cos(across), math.sin(across)
-    half = _AREA_LENGTH_M / 2
+    half = _EVEN_M / 2
     for side in (-half, half):
         beside = (spot[0] - dy * side, spot[1] + dx * side)
         if not floor.geometry.contains(*beside):
             raise _NoAreaError("are at the edge of the map")
         spread = floor.ranges(beside, np.array([across, across + math.pi]), reach)
         if abs(float(spread.sum()) - width) > 0.25 * width:
-            raise _NoAreaError(f"are not as wide all along {_AREA_LENGTH_M} m: a door, a corner or an uneven wall")
+            raise _NoAreaError(f"are not as wide all along {_EVEN_M} m: a door, a corner or an uneven wall")
     mount = (spot[0] - dx * (near - _MOUNT_GAP_M), spot[1] - dy * (near - _MOUNT_GAP_M))
     sonars = []
-    for angle in _SONAR_ANGLES:
+    for angle in ANGLES:
         cone = across + angle + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, 7)
         echo = float(floor.ranges(mount, cone, _SONAR_MAX_M + 1.0).min())
         limit = min(echo, _SONAR_MAX_M) - _WALL_MARGIN_M
         if limit < _CORRIDOR_M[0] / 2:
             raise _NoAreaError(_UNSEEN)
         sonars.append(Sonar(angle=angle, range_limit=round(limit, 2)))
+    # As long as the cones together are wide where they end: what stands elsewhere would leave the area clear.
+    half = max(_SHORTEST_M / 2, *(each.range_limit * math.sin(abs(each.angle) + SONAR_HALF_CONE) for each in sonars))
     corners = [
         (spot[0] + dx * u - dy * v, spot[1] + dy * u + dx * v)
         for u, v in ((-near, -half), (far, -half), (far, half), (-near, half))

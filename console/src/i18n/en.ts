@@ -146,6 +146,7 @@ export const en = {
   "state.clear": "clear",
   "area.overridden": "set by hand",
   "area.part_free": "a part is free: slowly",
+  "area.seen": "sensors see {share} of it",
   "area.unconfirmed": "unknown (not confirmed)",
   "since": "since {time}",
   "ago": "{age} ago",

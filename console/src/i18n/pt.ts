@@ -147,6 +147,7 @@ export const pt: Readonly<Record<keyof typeof en, string>> = {
   "state.clear": "livre",
   "area.overridden": "definida à mão",
   "area.part_free": "uma parte está livre: devagar",
+  "area.seen": "os sensores veem {share} dela",
   "area.unconfirmed": "desconhecida (não confirmada)",
   "since": "desde {time}",
   "ago": "há {age}",

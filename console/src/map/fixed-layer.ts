@@ -5,10 +5,9 @@ import { said } from "../i18n/codes";
 import { t } from "../i18n/i18n";
 import type { Live, Topic } from "../live/live";
 import { areaText, isPartlyFree, shownState } from "../sensors/words";
-import { outline, toPoint } from "./geometry";
+import { beam, outline, toPoint } from "./geometry";
 
 const toLatLng = (point: Point): L.LatLngTuple => [point[1], point[0]];
-const CONE_HALF_ANGLE = 0.26; // rad, of the sonars' data sheet: 15 degrees
 const TOPICS: readonly Topic[] = ["zone", "area", "node", "place"];
 
 /** Return a label: from afar the id alone. Names come from people: they are text, and never HTML. */
@@ -176,12 +175,8 @@ export class FixedLayer {
     const at: Point = [node.x, node.y];
     const health = node.online === false ? "offline" : node.state;
     const cones = (node.sonars ?? []).map(({ angle, range_limit: range }) => {
-      const middle = (node.theta ?? 0) + angle;
-      const edge = [-1, -0.5, 0, 0.5, 1].map((share) => {
-        const direction = middle + share * CONE_HALF_ANGLE;
-        return toLatLng([at[0] + range * Math.cos(direction), at[1] + range * Math.sin(direction)]);
-      });
-      return L.polygon([toLatLng(at), ...edge], { className: `cone ${health}`, interactive: false });
+      const outlined = beam(at, (node.theta ?? 0) + angle, range).map(toLatLng);
+      return L.polygon(outlined, { className: `cone ${health}`, interactive: false });
     });
     const marker = L.circleMarker(toLatLng(at), { radius: 5, className: `node ${health}` });
     marker.bindTooltip(label(node.id, "", said(node.code, node.reason)));

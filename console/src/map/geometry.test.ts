@@ -1,10 +1,15 @@
 import { expect, test } from "vitest";
 import { parseRoute, routeHash } from "../router";
-import { box, firstMetres, moved, outline } from "./geometry";
+import { beam, box, firstMetres, moved, outline } from "./geometry";
 
 test("a corridor's outline is half a width away from its line on all sides", () => {
   const [left, bottom, right, top] = box(outline({ type: "corridor", line: [[0, 0], [10, 0]], width: 2 }));
   expect([left, bottom, right, top].map((value) => Math.round(value * 1000) / 1000)).toEqual([-1, -1, 11, 1]);
+});
+
+test("a sonar's beam is 15 degrees wide in all", () => {
+  const edges = beam([1, 2], 0, 3).slice(1).map(([x, y]) => (Math.atan2(y - 2, x - 1) * 180) / Math.PI);
+  expect([Math.min(...edges), Math.max(...edges)].map((angle) => Math.round(angle * 100) / 100)).toEqual([-7.5, 7.5]);
 });
 
 test("a shape that is moved keeps its form", () => {

@@ -28,6 +28,14 @@ export function corridorOutline(line: readonly Point[], width: number): Point[] 
   return [...side(line), ...side([...line].reverse())];
 }
 
+/** Half of a sonar's beam (rad), as in `fog_contracts.cones`: the HC-SR04's is 15 degrees wide. */
+const BEAM_HALF_ANGLE = Math.PI / 24;
+
+/** Return the outline of what a sonar sees that looks from `at` into a direction (rad), up to its range (m). */
+export function beam(at: Point, direction: number, range: number): Point[] {
+  return [at, ...arc(at, range, direction - BEAM_HALF_ANGLE, 2 * BEAM_HALF_ANGLE, 4)];
+}
+
 /** Return the corners of a shape's outline. */
 export function outline(shape: Shape): Point[] {
   switch (shape.type) {

@@ -1,7 +1,7 @@
 """What a site's sensor nodes see: the share of each watched area, and the blind stretches of each route. Pure.
 
 A sonar sees what stands in its cone nearer than its range limit and before the first wall. What is looked for is as
-wide as a person, so it is seen when it touches a cone.
+wide as a person, so it is seen when it touches a cone (`fog_contracts.cones`).
 """
 
 from __future__ import annotations
@@ -13,28 +13,23 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.cones import sonar_cone
+from fog_contracts.cones import seen_cells, seen_share, sonar_cone
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
 from fog_contracts.geometry import lengths_along
 from fog_contracts.shapes import rasterize
 from fog_kernels.astar import Planner, nearest_traversable
-from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fognav_sim.sensors import LIDAR_MAX_M
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from fog_contracts.geometry import Point
     from fog_contracts.grid import StaticMap
     from fog_contracts.messages import Place
-    from fog_contracts.site import AreaSite, NodeSite, Site
+    from fog_contracts.site import Site
 
-OBSTACLE_RADIUS_M: Final = 0.25
-"""Half the width of a person, or of a box that is worth a detour."""
 SPEED_M_S: Final = 0.3
 _PLACE_REACH_M: Final = 0.5
 _SIGHT_STEP_M: Final = 0.25
@@ -102,8 +97,13 @@ class Coverage:
 def coverage(site: Site, static: StaticMap) -> Coverage:
     """Return what the nodes of a site see on its map."""
     walls = (static.cells != FREE).astype(np.uint8)
-    areas = [_area(area, [node for node in site.nodes if node.area == area.id], static, walls) for area in site.areas]
-    seen = _seen([cone for area in areas for cone in area.cones], static)
+    areas = []
+    for area in site.areas:
+        nodes = [node for node in site.nodes if node.area == area.id]
+        cones = [sonar_cone(node, sonar, static) for node in nodes for sonar in range(len(node.sonars))]
+        share = seen_share(area.polygon, nodes, static)
+        areas.append(AreaCoverage(area.id, [node.id for node in nodes], share, cones))
+    seen = seen_cells([cone for area in areas for cone in area.cones], static.geometry)
     rings = {area.id: area.polygon for area in site.areas}
     planner = Planner(static.geometry.width, static.geometry.height)
     cost = inflate(
@@ -129,25 +129,6 @@ def coverage(site: Site, static: StaticMap) -> Coverage:
             )
         )
     return Coverage(areas, routes, unreachable)
-
-
-def _seen(cones: Sequence[list[Point]], static: StaticMap) -> NDArray[np.bool_]:
-    """Return the cells in which something as wide as a person touches a cone."""
-    inside = np.zeros(static.geometry.shape, dtype=np.uint8)
-    for ring in cones:
-        window, mask = rasterize(ring, static.geometry)
-        inside[window.rows, window.columns][mask] = 1
-    reach = OBSTACLE_RADIUS_M / static.geometry.resolution
-    return np.asarray(squared_distance_capped(inside, max(1, math.ceil(reach) + 1)) <= reach**2)
-
-
-def _area(area: AreaSite, nodes: list[NodeSite], static: StaticMap, walls: NDArray[np.uint8]) -> AreaCoverage:
-    cones = [sonar_cone(node, sonar, static) for node in nodes for sonar in range(len(node.sonars))]
-    window, mask = rasterize(area.polygon, static.geometry)
-    floor = mask & (walls[window.rows, window.columns] == 0)
-    seen = _seen(cones, static)[window.rows, window.columns] & floor
-    share = float(np.count_nonzero(seen)) / max(1, int(np.count_nonzero(floor)))
-    return AreaCoverage(area.id, [node.id for node in nodes], share, cones)
 
 
 def _route(

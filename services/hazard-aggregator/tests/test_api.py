@@ -103,8 +103,11 @@ async def test_invalid_areas_are_refused_naming_the_field_and_a_dead_store_is_re
 
 async def test_area_that_is_the_cone_of_a_node_follows_it_and_is_unusable_without_it(fog, client, tokens):
     body = {"nodes": ["n1"], "cone_of": "n1"}
+    drawn = (await client.get("/api/v1/areas/hall")).json()["seen_share"]
     put = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
     assert put.status_code == 200, put.text
+    assert drawn < 0.6
+    assert (await client.get("/api/v1/areas/hall")).json()["seen_share"] > 0.95
     lowest = min(y for _, y in put.json()["polygon"])
     assert lowest == pytest.approx(3.0, abs=0.02), "n1 looks down from 4.5 m, 1.5 m far"
     text = (fog.site / "site.toml").read_text()

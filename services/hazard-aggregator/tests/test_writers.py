@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 import httpx
+import numpy as np
 import pytest
 from manual_clock import ManualClock
 from msgspec import structs
 
-from fog_contracts.grid import GridGeometry
+from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition
 from fog_runtime.health import Health
@@ -147,7 +148,8 @@ async def test_area_beyond_the_most_is_refused_until_one_is_removed_while_others
     tokens = Tokens([TokenEntry(name="ann", role="operator", sha256=token_hash("secret"))])
     async with Store(redis_url, "test", timeout_s=5.0) as store:
         service = await running(store, areas=areas)
-        app = make_api(service, GridGeometry(100, 100, 0.05, 0.0, 0.0), ManualClock(1.0), Health(), tokens)
+        static = StaticMap(GridGeometry(100, 100, 0.05, 0.0, 0.0), np.zeros((100, 100), np.uint8))
+        app = make_api(service, static, ManualClock(1.0), Health(), tokens)
         async with httpx.AsyncClient(
             transport=httpx.ASGITransport(app), base_url="http://fog", headers={"Authorization": "Bearer secret"}
         ) as client:

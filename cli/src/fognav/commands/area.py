@@ -79,6 +79,8 @@ def _line(area: Mapping[str, Any]) -> str:
     state = f"{hazard['state']}, {hazard['cause']}" if hazard else "nothing announced yet"
     if hazard and hazard["state"] == "blocked" and hazard.get("free"):
         state += "; a part of it is free, which robots pass slowly"
+    if hazard and hazard["state"] == "clear" and (share := area.get("seen_share")) is not None:
+        state += f"; its nodes see {share:.0%} of its floor"
     return f"{definition['id']}{label}: {state}" + (f" [{_override(override)}]" if override else "")
 
 

@@ -1,7 +1,7 @@
 """`fognav site`: creates and checks sites, and lets a fog node in containers serve several."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -13,7 +13,8 @@ from fognav.output import NOT_TRUE, exit_codes, fail, print_json, print_line, pr
 
 site_app = typer.Typer(cls=installed.Commands, help="Create and check sites.", no_args_is_help=True)
 
-
+LITTLE_SEEN: Final = 0.5
+"""`site check` names the areas of whose floor their nodes see a smaller share."""
 OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to create, without a site in it.")]
 SeedOption = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Each seed proposes other places.")]
 
@@ -85,6 +86,13 @@ def site_check(
             print_line(
                 f"nodes with a sonar without range_max: {found['unbounded_nodes']}. To it an echo from behind the wall "
                 "is clear: fognav node calibrate NODE --site DIR, unless it hears no wall"
+            )
+        little = {area: share for area, share in found["seen_shares"].items() if share < LITTLE_SEEN}
+        if little:
+            shares = ", ".join(f"{area} {share:.0%}" for area, share in little.items())
+            print_line(
+                f"areas of which their nodes see little: {shares}. What stands on the rest leaves them clear. Give "
+                "them `cone_of`, a shorter polygon, or more nodes: fognav site coverage DIR --png FILE draws the beams"
             )
         if found["areas_never_half_free"]:
             print_line(

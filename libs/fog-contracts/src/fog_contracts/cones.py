@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from fog_contracts.costs import FREE
 from fog_contracts.geometry import GeometryError, Point, normalized_polygon
-from fog_contracts.grid import StaticMap
+from fog_contracts.grid import GridGeometry, StaticMap
+from fog_contracts.shapes import rasterize, rasterize_line
 from fog_contracts.site import NodeSite
 
 _Floats = NDArray[np.float64]
@@ -28,6 +29,10 @@ _NECK_M: Final = 0.02
 """So near an HC-SR04 measures nothing (datasheet): there the outline joins cones that lie farther apart, and what looks
 at a wall nearer than that ends there, so that the outline touches the node once only."""
 _DECIMALS: Final = 4
+
+
+SEEN_BESIDE_M: Final = 0.25
+"""Half the width of a person, or of a box that is worth a detour: it is seen where it touches a cone."""
 
 
 class ConeError(ValueError):
@@ -98,6 +103,29 @@ def sonar_cones(nodes: Iterable[NodeSite], static: StaticMap) -> dict[str, list[
         ]
         for node in nodes
     }
+
+
+def seen_cells(cones: Iterable[list[Point]], geometry: GridGeometry) -> NDArray[np.bool_]:
+    """Return the cells (height, width) from which something half a metre wide touches one of the cones."""
+    seen = np.zeros(geometry.shape, dtype=np.bool_)
+    for cone in cones:
+        for window, mask in (rasterize(cone, geometry), rasterize_line([*cone, cone[0]], SEEN_BESIDE_M, geometry)):
+            seen[window.rows, window.columns] |= mask
+    return seen
+
+
+def seen_share(area: list[Point], nodes: Iterable[NodeSite], static: StaticMap) -> float:
+    """Return on which share of an area's free floor something half a metre wide touches a cone of the nodes (0 to 1).
+
+    The height of cones and things does not count: what is lower than a cone is not seen either.
+    """
+    window, mask = rasterize(area, static.geometry)
+    floor = mask & (static.cells[window.rows, window.columns] == FREE)
+    if not floor.any():
+        return 0.0
+    cones = [cone for outlines in sonar_cones(nodes, static).values() for cone in outlines]
+    seen = seen_cells(cones, static.geometry.part(window)) & floor
+    return float(np.count_nonzero(seen)) / int(np.count_nonzero(floor))
 
 
 def _angles(node: NodeSite, sonar: int) -> _Floats:

@@ -57,7 +57,7 @@ async def main() -> None:
     tokens = load_tokens(settings.tokens_file, settings.session_key_file)
     own = settings.credentials()
     http_process = HttpProcess.fork(
-        lambda: make_api(unused(), loaded.map.geometry, clock, health, tokens),
+        lambda: make_api(unused(), loaded.map, clock, health, tokens),
         settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
     )  # fmt: skip
     async with (
@@ -99,7 +99,7 @@ async def main() -> None:
             await service.records.subscribe()
             leadership.subscribe()
             zenoh.declare_liveliness("hazard-aggregator", site)
-            app = make_api(service, loaded.map.geometry, clock, health, tokens, leadership.standby_reason)
+            app = make_api(service, loaded.map, clock, health, tokens, leadership.standby_reason)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(leadership.run(service, {"mqtt": mqtt.broker_answers}), name="lease")
                 tasks.create_task(mqtt.run(), name="mqtt")

@@ -320,6 +320,24 @@ def test_area_that_the_aggregator_does_not_list_vanishes_from_the_map():
     assert fog.state("gate") == ("blocked", 254)
 
 
+def test_danger_of_a_newer_aggregator_stays_while_the_one_before_it_is_believed_and_does_not_list_its_area():
+    fog = running()
+    fog.deliver(ch.AREA_DEFINITION, structs.replace(definition("new", 1), epoch=6), area="new")
+    fog.hear(hazard("blocked", 1, area="new", epoch=6))
+    fog.beat(CLEAR, GATE)
+    assert fog.state("new") == ("blocked", 254)
+
+
+def test_danger_is_shown_again_after_a_heartbeat_from_before_its_area_came_late():
+    fog, new = running(), hazard("blocked", 1, area="new")
+    for heartbeat in ((CLEAR, GATE), (CLEAR, GATE, new)):
+        fog.deliver(ch.AREA_DEFINITION, structs.replace(definition("new", 1), epoch=5), area="new")
+        fog.hear(new)
+        fog.beat(*heartbeat)
+    fog.hear(new)  # as requested
+    assert fog.state("new") == ("blocked", 254)
+
+
 def test_area_stays_while_the_aggregator_does_not_know_all_areas_and_is_not_clear():
     fog = running()
     gate = hazard("clear", 5, area="gate")

@@ -150,7 +150,8 @@ class HazardsLayer(CostLayer):
             raise RefusedMessageError(f"it is about another area, {hazard.area}")
         old = self._received.get(hazard.area)
         last_of_removed = self._last_of_removed.get(hazard.area, (0, 0))
-        if hazard.epoch == last_of_removed[0] and hazard.seq <= last_of_removed[1]:
+        outdated = hazard.epoch == last_of_removed[0] and hazard.seq <= last_of_removed[1]
+        if outdated and not self.aggregator.confirms(hazard, at.now):  # else a late heartbeat had removed the area
             return []
         if old is not None:
             if hazard.epoch == old.epoch and hazard.seq <= old.seq:
@@ -166,10 +167,13 @@ class HazardsLayer(CostLayer):
         self._fence.raise_to(_AGGREGATOR, self.aggregator.epoch or 0)
         changed: list[Publication] = []
         if (listed := self.aggregator.areas(at.now)) is not None:
-            changed = [p for area in list(self._areas) if area not in listed for p in self._remove(area)]
+            epoch = self.aggregator.epoch or 0
+            # What a newer aggregator has defined, which is not believed yet, this one can't know.
+            gone = [name for name, area in self._areas.items() if name not in listed and area.defined_by <= epoch]
+            changed = [p for name in gone for p in self._remove(name)]
             own = [d for d in self._lower.values() if d.epoch == self.aggregator.epoch]
             changed += [p for definition in own for p in self._announced(definition, at)]
-            self._received = {area: hazard for area, hazard in self._received.items() if area in listed}
+            self._received = {n: hazard for n, hazard in self._received.items() if n in listed or n in self._areas}
         return [*changed, *self._refresh_all(at)]
 
     # --- State ------------------------------------------------------------------------------------------------------

@@ -121,16 +121,18 @@ async def test_period_of_an_area_is_written_once_continues_over_restarts_and_is_
             await store.history("hall", cursor="1", limit=9, at=at(0.0))
 
 
-async def test_history_of_a_removed_area_is_forgotten_once_it_is_90_days_old(redis: Server):
+async def test_history_of_an_area_that_is_no_more_is_forgotten_once_it_is_90_days_old(redis: Server):
     day = 86_400.0
     gone, back = (AreaDefinition(id=name, polygon=[(0, 0), (1, 0), (1, 1)], removed=True) for name in ("hall", "new"))
-    core = SimpleNamespace(definitions=lambda: [gone, back])
+    here = msgspec.structs.replace(gone, id="here", removed=False)
+    core = SimpleNamespace(definitions=lambda: [gone, back, here])
     async with Store(redis.url, "test", timeout_s=5.0) as store, Redis.from_url(redis.url) as raw:
-        for area, stamp in (("hall", 0.0), ("new", 5 * day)):
+        for area, stamp in (("hall", 0.0), ("new", 5 * day), ("here", 0.0), ("left", 0.0)):
             of_area = msgspec.structs.replace(hazard(1), area=area)
+            await store.save_hazards([of_area])  # of the one that left site.toml, nothing else is left
             await store.begin_period(of_area, period_of(of_area, at(stamp)))
         history = HistoryPersistence(core, store, asyncio.Event())  # type: ignore[arg-type]  # all that it needs of a core
-        for stamp, left in ((89 * day, [b"hall", b"new"]), (91 * day, [b"new"])):
+        for stamp, left in ((89 * day, [b"hall", b"here", b"left", b"new"]), (91 * day, [b"here", b"new"])):
             await history.forget_removed(at(stamp))
             assert sorted(key.rpartition(b":")[2] for key in await raw.keys("fog:test:history:*")) == left
 

@@ -91,11 +91,10 @@ class HistoryPersistence:
         return await self._store.history(area, cursor=cursor, limit=limit, at=at)
 
     async def forget_removed(self, at: Moment) -> None:
-        """Forget, once a day, what became of areas that were removed 90 days ago; raises `StoreError`."""
+        """Forget, once a day, what became of areas that have been gone for 90 days; raises `StoreError`."""
         if at.now < self._forget_at:
             return
-        removed = [definition.id for definition in self._core.definitions() if definition.removed]
-        await self._store.forget_histories(removed, at.stamp)
+        await self._store.forget_histories(self._core.definitions(), at.stamp)
         self._forget_at = at.now + _FORGET_S
 
     async def run(self) -> None:

@@ -26,7 +26,7 @@ from hazard_aggregator.history import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Alert
@@ -163,9 +163,15 @@ class Store(RedisStore):
         found = [(entry_id.decode(), fields) for entry_id, fields in reply]
         return page_of([(name, _data(fields)) for name, fields in found], cursor=cursor, limit=limit, at=at)
 
-    async def forget_histories(self, areas: Iterable[str], stamp: float) -> None:
-        """Forget the histories of removed areas in which nothing has begun for `RETENTION_S` before `stamp`."""
-        for area in areas:
+    async def forget_histories(self, definitions: Collection[AreaDefinition], stamp: float) -> None:
+        """Forget the histories of areas that are no more, in which nothing has begun for `RETENTION_S` before `stamp`.
+
+        `definitions` are those in force and of removed areas. One that left `site.toml` has none: its last hazard is
+        stored still.
+        """
+        present = {definition.id for definition in definitions if not definition.removed}
+        stored = await self._readable_records(_HAZARDS, AreaHazard)
+        for area in {*stored, *(definition.id for definition in definitions)} - present:
             key, oldest = self._key(f"{_HISTORY}:{area}"), f"{stamp - RETENTION_S:.3f}"
             await self._redis.write(("EVAL", records.FORGET, 1, key, oldest))
 

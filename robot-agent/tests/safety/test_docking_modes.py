@@ -199,6 +199,14 @@ def test_condition_that_stops_a_robot_refuses_an_undocking_and_ends_one_as_it_st
     assert gate.run(**MISSION).mode == ("DOCK" if leaves == "HOLD" else leaves), "a mission begins it anew"
 
 
+def test_third_protective_stop_within_a_minute_of_a_robot_on_its_dock_is_a_fault_as_on_any_drive():
+    gate = Gate(**ON_DOCK)
+    for _ in range(3):
+        assert gate.run(2.2, **MISSION).mode == "DOCK"
+        gate.run(2 * DT, **MISSION, lidar_age=0.31)
+    assert gate.out.mode == "FAULT", "a loose plug would let it start and stop all day"
+
+
 @pytest.mark.parametrize("fault", [*FAULTS, {"bumper": True, "docked_for": None}])
 def test_fault_during_an_undocking_is_latched(fault):
     gate = undocking()

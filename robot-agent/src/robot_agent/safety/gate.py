@@ -275,7 +275,7 @@ def _maneuver(
     result = maneuver.proceed(running, inputs, findings, now, config)
     if isinstance(result, Maneuver):
         mode: Mode = rules.mode if inputs.resting is None else "INIT"
-        return replace(state, mode=mode, stops=(), stopped_since=math.inf, maneuver=result)
+        return replace(state, mode=mode, stopped_since=math.inf, maneuver=result)
     faults = tuple(finding for finding in findings if finding.level == Level.FAULT)
     if faults:
         state = replace(state, latched=faults, last_reasons=tuple(fault.reason for fault in faults))

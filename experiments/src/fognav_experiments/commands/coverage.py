@@ -10,7 +10,7 @@ import typer
 from fog_runtime.configuration.site import SiteError, load_site
 from fognav import checkout, kernels
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads it
-from fognav.output import FailedError, WrongUseError, check_writable, exit_codes, print_answer, print_json
+from fognav.output import FailedError, WrongUseError, check_writable, exit_codes, print_answer, print_json, print_line
 
 if TYPE_CHECKING:
     from fog_contracts.site import Site
@@ -47,7 +47,7 @@ def site_coverage(
             check_writable(png)
         try:
             loaded = load_site(checkout.site_folder(folder))
-            kernels.warm_cache(print_answer)
+            kernels.warm_cache(print_line)
         except SiteError as error:
             raise WrongUseError(str(error)) from error
         except kernels.KernelsError as error:

@@ -6,6 +6,7 @@ import platform
 import re
 import signal
 import subprocess
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -214,6 +215,13 @@ def pytest_terminal_summary(terminalreporter: "TerminalReporter", config: pytest
     line = f"{datetime.now(UTC):%Y-%m-%d}, {config.stash[COMMIT]}: {told} ({machine})\n"
     LAST_LONG_RUN.write_text(line, "utf-8")
     terminalreporter.line(f"commit {LAST_LONG_RUN.relative_to(ROOT)}: {line}")
+
+
+@pytest.fixture(scope="module")
+def forked_programs() -> Iterator[None]:
+    """Let supervisors of a module's tests fork Fognav's programs, where the start of one is not what is tested."""
+    with programs.fork_supervised():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -138,6 +138,7 @@ def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:
 
 
 @pytest.mark.live
+@pytest.mark.usefixtures("forked_programs")
 async def test_clients_of_every_kind_are_answered_while_the_heartbeat_is_timed(tmp_path) -> None:
     floor = common.make_office(60.0, 40.0)
     common.write_site(tmp_path, floor)
@@ -230,6 +231,7 @@ async def test_no_reading_of_a_small_load_is_lost_and_hazards_reach_the_map(tmp_
 
 @pytest.mark.live
 @pytest.mark.timeout(300)
+@pytest.mark.usefixtures("forked_programs")
 async def test_robots_that_are_played_on_a_floor_drive_and_each_of_its_programs_is_counted(tmp_path: Path) -> None:
     found = await floors.measure(tmp_path, [1], floors.Traffic(2, 3, settle_s=5.0), 5.0, lambda _: None)
     (one,) = found["counts"]

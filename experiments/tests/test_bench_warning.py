@@ -181,6 +181,7 @@ async def test_relay_passes_everything_on_in_its_order_later_by_its_delay():
 
 
 @pytest.mark.live
+@pytest.mark.usefixtures("forked_programs")
 async def test_robot_is_warned_while_the_leading_planner_becomes_slow_and_another_takes_over():
     loaded = load_site(checkout.site_folder(Path("estig")))
     rows = await second_planner.measure(loaded, "slow", 1, 1, lambda: None)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-import psutil
+import programs
 from lateness import Lateness
 
 from fog_contracts import channels as ch
@@ -105,6 +105,7 @@ class LiveSystem:
 
     async def __aenter__(self) -> Self:
         try:
+            self._contexts.enter_context(programs.fork_supervised())
             await self._contexts.enter_async_context(self.stack)
             await self.stack.start()
             edge = await self._contexts.enter_async_context(
@@ -232,7 +233,12 @@ class LiveSystem:
 
     def lateness(self) -> Lateness:
         """Return what tells how late a busy machine makes this process and its programs from now on."""
-        return Lateness(lambda: [os.getpid(), *(child.pid for child in psutil.Process().children(recursive=True))])
+
+        def pids() -> list[int]:
+            started = list(self.stack.pids().values())
+            return [os.getpid(), *started, *(one for pid in started for one in children(pid))]
+
+        return Lateness(pids)
 
     # --- waiting ---
 

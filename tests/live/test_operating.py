@@ -5,14 +5,11 @@ import os
 import re
 import shlex
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import programs
 import pytest
-
-from fog_supervisor import child
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(900)]
 
@@ -70,7 +67,7 @@ def speed() -> list[str]:
     return [f"--speed={BUSY_SPEED}"] if busy else []
 
 
-def wait_for(pattern: str, output: Path, demo: subprocess.Popen[bytes]) -> re.Match[str]:
+def wait_for(pattern: str, output: Path, demo: programs.Program) -> re.Match[str]:
     deadline = time.monotonic() + START_TIMEOUT_S
     while (found := re.search(pattern, output.read_text("utf-8"), re.MULTILINE)) is None:
         assert demo.poll() is None, output.read_text("utf-8")
@@ -87,11 +84,8 @@ def test_walk_through_a_running_demo_works_as_the_readme_says(tmp_path):
     assert len(commands) > 8
     terminal = Terminal(tmp_path / "runtime", dict(os.environ))
     printed = tmp_path / "demo.txt"
-    with printed.open("wb") as output:
-        demo = subprocess.Popen(
-            child.command(sys.executable, "-m", "fognav", *terminal.arguments(start), *speed()),
-            cwd=ROOT, env=terminal.environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0,
-        )  # fmt: skip
+    arguments = (*terminal.arguments(start), *speed())
+    demo = programs.start("fognav", terminal.environment, printed, *arguments, leads=True, forks=True)
     try:
         zone = wait_for(r"^draw a zone: (.+)$", printed, demo)
         wait_for("^planner: plan 1", printed, demo)

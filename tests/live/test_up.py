@@ -56,17 +56,21 @@ class Node:
         self.printed = folder / "up.txt"
         inherited = {key: value for key, value in os.environ.items() if not key.startswith("FOGNAV_")}
         self.environment = {**inherited, **floor_ports(), "XDG_RUNTIME_DIR": str(folder / "runtime")}
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[bytes] | programs.Program | None = None
 
     def up(self) -> None:
-        command = [sys.executable, "-m", "fognav", "up", "--data", str(self.data), "--bind", "127.0.0.1"]
-        found = [] if self.source is None else [*self.source.glob("*/src"), *self.source.glob("*/*/src")]
-        environment = {**self.environment, "PYTHONPATH": os.pathsep.join(map(str, found))}
-        with self.printed.open("wb") as output:
-            self.process = subprocess.Popen(
-                child.command(*command, *self.options), env=environment, stdin=subprocess.DEVNULL, stdout=output,
-                stderr=output,
-            )  # fmt: skip
+        arguments = ("up", "--data", str(self.data), "--bind", "127.0.0.1", *self.options)
+        self.printed.write_bytes(b"")
+        if self.source is None:
+            self.process = programs.start("fognav", self.environment, self.printed, *arguments, forks=True)
+        else:
+            found = [*self.source.glob("*/src"), *self.source.glob("*/*/src")]
+            environment = {**self.environment, "PYTHONPATH": os.pathsep.join(map(str, found))}
+            with self.printed.open("wb") as output:
+                self.process = subprocess.Popen(
+                    child.command(sys.executable, "-m", "fognav", *arguments), env=environment,
+                    stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+                )  # fmt: skip
         self.wait(lambda: "is up:" in self.printed.read_text(), "it is up")
 
     def run(self, *arguments: str) -> str:

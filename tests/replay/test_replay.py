@@ -71,7 +71,7 @@ from robot_agent.agent.recording.replay import replay
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.live, pytest.mark.timeout(300), pytest.mark.usefixtures("forked_programs")]
 
 HERE = Path(__file__).parent
 SITE = HERE.parents[1] / "sites" / "estig"

@@ -10,6 +10,7 @@ type a hundred.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import fcntl
@@ -24,17 +25,22 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from functools import cache
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from fog_supervisor import supervisor
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
 RUN = os.getpid()
 """The process that runs the tests, or lets its workers run them: then the root's conftest.py names it."""
 _MESSAGE_BYTES = 1 << 17
+_READ_LATER = ("PYTHONPATH", "PYTHONUNBUFFERED", "PYTHONDONTWRITEBYTECODE")
+"""Of Python's own variables, those that a forked program respects."""
 _LOADED_BY_COMMANDS = {
     "fognav": ("fognav.commands.installed", "fognav.commands.status", "fognav.commands.zone", "fognav.commands.area",
                "fognav.commands.robot", "fognav.commands.access", "fognav.commands.node", "fognav.operate.fog")
@@ -47,7 +53,7 @@ class Program:
 
     def __init__(self, module: str, answers: socket.socket) -> None:
         self.module = module
-        self._answers = answers
+        self.answers = answers
         self.pid = int(answers.recv(64))
         self.returncode: int | None = None
 
@@ -61,11 +67,11 @@ class Program:
         """Wait for its end; return the exit code as `poll` does, or raise `subprocess.TimeoutExpired`."""
         if self.returncode is None:
             with selectors.DefaultSelector() as selector:
-                selector.register(self._answers, selectors.EVENT_READ)
+                selector.register(self.answers, selectors.EVENT_READ)
                 if not selector.select(timeout):
                     raise subprocess.TimeoutExpired(f"python -m {self.module}", timeout or 0.0)
-            self.returncode = os.waitstatus_to_exitcode(int(self._answers.recv(64)))
-            self._answers.close()
+            self.returncode = os.waitstatus_to_exitcode(int(self.answers.recv(64)))
+            self.answers.close()
         return self.returncode
 
     def send_signal(self, number: int) -> None:
@@ -82,13 +88,66 @@ class Program:
         self.send_signal(signal.SIGKILL)
 
 
-def start(module: str, environment: Mapping[str, str], log: Path) -> Program:
+@contextlib.contextmanager
+def fork_supervised() -> Iterator[None]:
+    """Let supervisors of this process fork Fognav's programs; their environment and command line show in no /proc.
+
+    `fognav demo` and `fognav up` are processes of their own, which start theirs really unless they are told not to.
+    """
+    launch = supervisor.launch
+
+    async def fork(program: supervisor.Program) -> asyncio.subprocess.Process | _Supervised:
+        is_module = len(program.arguments) == 3 and program.arguments[:2] == (sys.executable, "-m")
+        if not is_module or _read_at_import(program.environment) != _read_at_import(os.environ):
+            return await launch(program)
+        # Not on the loop's thread: it waits until the parent has its imports.
+        request = program.arguments[2], program.environment, program.log
+        starting = asyncio.ensure_future(asyncio.to_thread(start, *request, leads=True))
+        try:
+            return _Supervised(await asyncio.shield(starting))
+        except asyncio.CancelledError:
+            (await starting).kill()
+            raise
+
+    supervisor.launch = fork
+    try:
+        yield
+    finally:
+        supervisor.launch = launch
+
+
+class _Supervised:
+    """What a supervisor uses of `asyncio.subprocess.Process`."""
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self.pid = program.pid
+
+    async def wait(self) -> int:
+        """Wait for its end; return the exit code, negative for a signal."""
+        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+        loop.add_reader(self._program.answers, ended.set)
+        try:
+            await ended.wait()
+        finally:
+            loop.remove_reader(self._program.answers)
+        return self._program.wait()
+
+
+def start(
+    module: str, environment: Mapping[str, str], log: Path, *arguments: str, leads: bool = False, forks: bool = False
+) -> Program:
     """Start `python -m module`; its output is appended to `log`.
 
+    It `leads` a session of its own, or none; and `forks` what it supervises, as within `fork_supervised`.
     Raises ValueError for a variable that Python or numba would have read before the fork; PYTHONPATH is respected.
     """
     with log.open("ab") as file:
-        return _start({"module": module, "environment": dict(environment), "in": str(Path.cwd())}, file, file)
+        request = {
+            "module": module, "environment": dict(environment), "in": str(Path.cwd()), "arguments": arguments,
+            "leads": leads, "forks": forks,
+        }  # fmt: skip
+        return _start(request, file, file)
 
 
 def run(
@@ -107,6 +166,9 @@ def run(
         return subprocess.CompletedProcess(list(arguments), code, output.read(), errors.read())
 
 
+_starting = threading.Lock()
+
+
 def _start(request: Mapping[str, Any], output: IO[Any], errors: IO[Any]) -> Program:
     module, environment = request["module"], request["environment"]
     if late := _read_at_import(environment) ^ _read_at_import(os.environ):
@@ -114,7 +176,9 @@ def _start(request: Mapping[str, Any], output: IO[Any], errors: IO[Any]) -> Prog
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
         passed = [theirs.fileno(), output.fileno(), errors.fileno()]
-        socket.send_fds(_parent(module), [json.dumps(request).encode()], passed)
+        with _starting:
+            parent = _parent(module)
+        socket.send_fds(parent, [json.dumps(request).encode()], passed)
     return Program(module, ours)
 
 
@@ -122,7 +186,7 @@ def _read_at_import(environment: Mapping[str, str]) -> set[tuple[str, str]]:
     return {
         (name, value)
         for name, value in environment.items()
-        if name.startswith(("PYTHON", "NUMBA_")) and name != "PYTHONPATH"
+        if name.startswith(("PYTHON", "NUMBA_")) and name not in _READ_LATER
     }
 
 
@@ -246,10 +310,16 @@ def main() -> None:
         sys.path[1:1] = more
         os.environ.clear()
         os.environ.update(environment)
-        sys.argv[:] = [file, *request.get("arguments", ())]
+        sys.argv[:] = [file, *request["arguments"]]
+        sys.dont_write_bytecode = bool(environment.get("PYTHONDONTWRITEBYTECODE"))
+        if environment.get("PYTHONUNBUFFERED"):
+            sys.stdout.reconfigure(write_through=True)
+        if request.get("leads"):
+            os.setsid()
         os.chdir(request["in"])
         time.tzset()
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
+        with fork_supervised() if request.get("forks") else contextlib.nullcontext():
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":

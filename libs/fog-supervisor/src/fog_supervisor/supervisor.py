@@ -76,6 +76,19 @@ class _Supervised:
         self.last_exit = ""
 
 
+async def launch(program: Program) -> asyncio.subprocess.Process:
+    """Start a program in a session of its own; it ends with this process. Fognav's tests fork it instead."""
+    with program.log.open("ab") as log:
+        return await asyncio.create_subprocess_exec(
+            *child.command(*program.arguments),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env=dict(program.environment),
+            start_new_session=True,
+        )
+
+
 def log_tail(path: Path, lines: int = _LOG_TAIL) -> str:
     """Return the last lines of a log file."""
     try:
@@ -246,15 +259,7 @@ class Supervisor:
     async def _spawn(self, supervised: _Supervised) -> asyncio.subprocess.Process:
         program = supervised.program
         program.before()
-        with program.log.open("ab") as log:
-            process = await asyncio.create_subprocess_exec(
-                *child.command(*program.arguments),
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env=dict(program.environment),
-                start_new_session=True,
-            )
+        process = await launch(program)
         supervised.process = process
         supervised.starts += 1
         self._emit(supervised, "started", f"pid {process.pid}")

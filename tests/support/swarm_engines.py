@@ -1,4 +1,4 @@
-"""Docker engines in network namespaces of this machine, joined into a swarm.
+"""Docker engines in network namespaces of this machine, joined into a swarm: machines that can be killed and cut off.
 
 Each has a namespace, a folder and a cgroup of its own, and a cable (veth) to one bridge. Images come from the engine
 that `docker` reaches. Needs root, `dockerd`, `ip` and `nsenter`. Everything is removed at the end, whatever was killed.
@@ -62,7 +62,8 @@ class Engine:
         self._cable = f"fn{part}-{number}"
         self._bridge = f"{BRIDGE}{part}"
         self._cgroup = f"/{self._space}"
-        self._socket = f"unix://{self._folder}/docker.sock"
+        self.socket = f"unix://{self._folder}/docker.sock"
+        self._program: subprocess.Popen[bytes] | None = None
 
     def plug(self) -> None:
         """Make its namespace and its cable to the bridge."""
@@ -85,35 +86,55 @@ class Engine:
         (self._folder / "pid").unlink(missing_ok=True)
         command = [
             "nsenter", f"--net=/run/netns/{self._space}", "dockerd", "--storage-driver=overlay2",
-            f"--data-root={self._folder}/data", f"--exec-root={self._folder}/exec", f"--host={self._socket}",
+            f"--data-root={self._folder}/data", f"--exec-root={self._folder}/exec", f"--host={self.socket}",
             f"--pidfile={self._folder}/pid", f"--cgroup-parent={self._cgroup}", "--dns-opt=ndots:1",
         ]  # fmt: skip
         with (self._folder / "log").open("ab") as log:
-            subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            self._program = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         wait(self.answers, START_S, f"no engine in {self._folder / 'log'}")
 
     def answers(self) -> bool:
         """Whether the engine answers."""
-        command = ["docker", "--host", self._socket, "version"]
+        command = ["docker", "--host", self.socket, "version"]
         return subprocess.run(command, capture_output=True, check=False, timeout=START_S).returncode == 0
 
     def docker(self, *arguments: str, timeout_s: float = COMMAND_S) -> str:
         """Run a command of docker here."""
-        return run("docker", "--host", self._socket, *arguments, timeout_s=timeout_s)
+        return run("docker", "--host", self.socket, *arguments, timeout_s=timeout_s)
 
     def load(self, images: Sequence[str]) -> None:
         """Take images over from the engine that `docker` reaches."""
         with subprocess.Popen(["docker", "save", *images], stdout=subprocess.PIPE) as saving:
-            command = ["docker", "--host", self._socket, "load", "--quiet"]
+            command = ["docker", "--host", self.socket, "load", "--quiet"]
             subprocess.run(command, stdin=saving.stdout, check=True, timeout=COMMAND_S, stdout=subprocess.DEVNULL)
         assert saving.returncode == 0
+
+    def cut_off(self) -> None:
+        """Pull its cable."""
+        run("ip", "link", "set", self._cable, "down")
+
+    def reconnect(self) -> None:
+        """Put it back."""
+        run("ip", "link", "set", self._cable, "up")
 
     def containers(self) -> dict[str, dict[str, Any]]:
         """Return the containers that run here, by their service's name in the stack."""
         ids = self.docker("ps", "--quiet").split()
-        found = json.loads(self.docker("inspect", *ids)) if ids else []
+        command = [
+            "docker",
+            "--host",
+            self.socket,
+            "inspect",
+            *ids,
+        ]  # it fails for what has just ended, and has the others
+        found = json.loads(subprocess.run(command, capture_output=True, check=False).stdout) if ids else []
         label = "com.docker.swarm.service.name"
         return {each["Config"]["Labels"].get(label, "").partition("_")[2]: each for each in found}
+
+    def logs(self, label: str) -> str:
+        """Return what all containers here have said that have a label, those that ended among them."""
+        ids = self.docker("ps", "--all", "--quiet", "--filter", f"label={label}").split()
+        return "".join(run("sh", "-c", f"docker --host {self.socket} logs {each} 2>&1") for each in ids)
 
     def _pids(self) -> list[int]:
         """Return the engine's processes, and those in its containers."""
@@ -134,6 +155,8 @@ class Engine:
             for pid in self._pids():
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
+        if self._program is not None:
+            self._program.wait(START_S)
 
     def remove(self) -> None:
         """Kill it, and remove all traces."""
@@ -183,6 +206,14 @@ class Swarm:
     def nodes(self) -> list[str]:
         """Return the ids of the engines, in their order."""
         return [engine.docker("info", "--format", "{{.Swarm.NodeID}}").strip() for engine in self.engines]
+
+    def unsettled(self) -> set[str]:
+        """Return the services that don't have the tasks that they should have, as the third engine knows."""
+        command = ["docker", "--host", self.engines[2].socket, "service", "ls", "--format", "{{.Name}} {{.Replicas}}"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            return {"no manager leads"}
+        return {line for line in done.stdout.splitlines() if not line.endswith(" 1/1")}
 
     def label(self, labels: Iterable[dict[str, str]]) -> None:
         """Give each engine its labels."""

@@ -106,7 +106,10 @@ def fork_supervised() -> Iterator[None]:
         try:
             return _Supervised(await asyncio.shield(starting))
         except asyncio.CancelledError:
-            (await starting).kill()
+            ended = await starting
+            ended.kill()
+            with contextlib.suppress(ProcessLookupError):  # it has started none itself
+                os.killpg(ended.pid, signal.SIGKILL)
             raise
 
     supervisor.launch = fork

@@ -122,8 +122,8 @@ class RedisConnection:
 
     async def read(self, *command: Argument) -> Any:  # noqa: ANN401  # redis does not type its replies
         """Execute a command that changes nothing, and return its reply."""
-        # redis does not type it
-        return await self._twice(lambda: self._client.execute_command(*command))  # type: ignore[no-untyped-call]
+        client = self._client
+        return await self._twice(lambda: client.execute_command(*command))  # type: ignore[no-untyped-call]  # redis's
 
     async def write(self, *commands: Command) -> list[Any]:
         """Execute commands as one transaction and return their replies.

@@ -14,6 +14,7 @@ import threading
 import time
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -127,7 +128,16 @@ class Floor:
             for service in stack["services"].values():
                 service["labels"] = {"changed": f"{time.time()}"}
             file.write_text(yaml.safe_dump(stack, sort_keys=False), "utf-8")
+            engine = self.engines[machine - 1]
+            before = {each["Id"] for each in engine.containers().values()}
             self.deploy(f"{SITE}.{machine}")
+            replaced = partial(self._replaced, engine, before)
+            wait(replaced, READY_S, f"{engine.name} runs what it had before")
+            self.wait_ready()
+
+    @staticmethod
+    def _replaced(engine: Engine, before: set[str]) -> bool:
+        return not before & {each["Id"] for each in engine.containers().values()}
 
     def unready(self) -> dict[str, set[str]]:
         """Return what does not run, or is not healthy, by its engine's name."""

@@ -17,6 +17,7 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import programs
@@ -36,11 +37,44 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(900)]
 LOG = logging.getLogger(__name__)
 ROOT = Path(__file__).parents[2]
 WAIT_S = 180.0
+LEG_S = 600.0
+"""For a leg of a drive, or a way across the floor."""
 CELL_M = 0.05
-START = (1.4, 1.4, 0.0)
-ROUND = [(2.6, 1.4), (7.2, 1.4), (7.2, 3.6), (6.9, 5.2), (5.4, 5.2), (2.6, 5.0), (1.45, 4.9), (1.4, 3.1), (1.4, 1.4),
-         (3.0, 1.4), (1.4, 1.4)]  # fmt: skip
-"""Where it is driven while it records (m): once round the core of the building, and back to its mark."""
+
+
+class Building(NamedTuple):
+    """A building that nobody has mapped: where the robot is first, its way round, and what that leads round (m).
+
+    `map`: of the simulated world, in the checkout or in the folder of recordings; "": a small house.
+    """
+
+    map: str
+    start: tuple[float, float, float]
+    round: list[tuple[float, float]]
+    core: tuple[float, float]
+    ahead: float = 3.2
+    """How far ahead of it is free."""
+
+
+HOUSE = Building(
+    "", (1.4, 1.4, 0.0),
+    [(2.6, 1.4), (7.2, 1.4), (7.2, 3.6), (6.9, 5.2), (5.4, 5.2), (2.6, 5.0), (1.45, 4.9), (1.4, 3.1), (1.4, 1.4),
+     (3.0, 1.4), (1.4, 1.4)],
+    (4.2, 3.2),
+)  # fmt: skip
+ESTIG = Building(
+    "sites/estig/map.yaml", (4.0, 4.5, 0.0),
+    [(4.9, 4.5), (4.9, 14.9), (20.0, 14.9), (40.0, 14.9), (56.0, 14.9), (56.0, 4.5), (40.0, 4.5), (20.0, 4.5),
+     (4.9, 4.5), (4.9, 8.0), (4.0, 4.5)],
+    (30.0, 10.0),
+)  # fmt: skip
+INTEL = Building(
+    "maps/intel_bwi/intel.yaml", (9.0, 12.0, math.pi / 2),
+    [(8.6, 18.0), (8.2, 28.0), (8.3, 36.0), (8.0, 43.0), (8.5, 46.5), (20.0, 46.3), (36.0, 46.3), (40.5, 44.5),
+     (41.5, 41.0), (43.5, 36.5), (45.3, 32.0), (46.5, 21.0), (46.0, 12.0), (45.5, 7.6), (38.0, 7.7), (30.0, 8.5),
+     (15.0, 8.6), (11.0, 9.5), (9.0, 12.0), (8.6, 18.0), (9.0, 12.0)],
+    (30.0, 20.0),
+)  # fmt: skip
 TRUTH = "axle_m = 0.235"
 SITE = """
 id = "truth"
@@ -52,8 +86,8 @@ radius = 0.17
 """
 
 
-def house(folder: Path) -> StaticMap:
-    """Write a building with a corridor round its core, and niches by which its sides differ."""
+def house() -> StaticMap:
+    """Return a building with a corridor round its core, and niches by which its sides differ."""
     cells = np.full((150, 190), UNKNOWN, np.uint8)
     for x0, y0, x1, y1, kind in (
         (0.5, 0.5, 8.5, 6.5, LETHAL), (0.6, 0.6, 8.4, 6.4, FREE), (2.2, 2.2, 6.2, 4.2, LETHAL),
@@ -61,10 +95,7 @@ def house(folder: Path) -> StaticMap:
         (0.6, 2.9, 0.9, 3.3, LETHAL), (3.2, 6.0, 4.6, 6.4, LETHAL),
     ):  # fmt: skip
         cells[round(y0 / CELL_M) : round(y1 / CELL_M), round(x0 / CELL_M) : round(x1 / CELL_M)] = kind
-    made = StaticMap(GridGeometry(190, 150, CELL_M, 0.0, 0.0), cells)
-    folder.mkdir()
-    save_map(folder / "map", made)
-    return made
+    return StaticMap(GridGeometry(190, 150, CELL_M, 0.0, 0.0), cells)
 
 
 def commands() -> list[str]:
@@ -75,11 +106,13 @@ def commands() -> list[str]:
 class Person:
     """Who follows the page: types its commands, measures by a ruler, holds keys, and sees where the robot stands."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, building: Building, truth: StaticMap) -> None:
         self.folder = folder
-        self.truth = house(folder / "house")
+        self.building, self.truth = building, truth
+        (folder / "house").mkdir()
+        save_map(folder / "house" / "map", truth)
         self.root = folder / "robot"
-        self.stand(START)
+        self.stand(building.start)
         self.log = folder / "truth.jsonl"
         runtime = folder / "runtime"
         runtime.mkdir(mode=0o700)
@@ -93,7 +126,7 @@ class Person:
         }
         self.recorder: subprocess.Popen[bytes] | None = None
         self.recorded: list[str] = []
-        self.mark = START
+        self.mark = building.start
         self.calibrating = False
         self.said: list[str] = []
         self.robot = ExitStack()
@@ -244,16 +277,17 @@ class Person:
                 for _ in range(2):
                     for key in "jluo":
                         self.hold(key, self.turned(2 * math.pi))
+                    start = np.array(self.building.start)
                     self.keys(b"wwwww")
-                    self.go([(4.6, 1.4)])
-                    self.face(0.0)
-                    self.hold(",", lambda: self.pose()[0] < START[0])
+                    self.go([place(start, np.array([[self.building.ahead, 0.0]]))[0].tolist()])
+                    self.face(start[2])
+                    self.hold(",", lambda start=start: between(start, np.array(self.pose()))[0] < 0.0)
                     self.keys(b"xxxxx")
-                    self.go([START[:2]])
+                    self.go([self.building.start[:2]])
             else:
                 self.keys(b"wwwww")
                 self.mark = self.pose()
-                self.go(ROUND)
+                self.go(self.building.round)
                 self.face(self.mark[2])
         finally:
             self.driver.send_signal(signal.SIGINT)
@@ -292,7 +326,7 @@ class Person:
 
     def go(self, way) -> None:
         for x, y in way:
-            until = time.monotonic() + WAIT_S
+            until = time.monotonic() + LEG_S
             while math.dist((at := self.pose())[:2], (x, y)) > 0.15:
                 assert time.monotonic() < until, f"{at} did not come to {(x, y)}: {''.join(self.said[-5:])}"
                 off = math.remainder(math.atan2(y - at[1], x - at[0]) - at[2], math.tau)
@@ -326,14 +360,21 @@ class Person:
         file.write_text(text.replace("radius_m = 0.0", "radius_m = 0.17"), "utf-8")
 
 
-@pytest.fixture
-def person(tmp_path):
-    made = Person(tmp_path)
+@pytest.fixture(params=[HOUSE, ESTIG, INTEL], ids=["house", "estig", "intel"])
+def person(request, tmp_path):
+    building = request.param
+    if not building.map:
+        truth = house()
+    else:
+        checked_out = (ROOT / building.map).is_file()
+        truth = load_map((ROOT if checked_out else request.getfixturevalue("data_dir")) / building.map)
+    made = Person(tmp_path, building, truth)
     with made.rest, made.robot:
         yield made
 
 
 @pytest.mark.long
+@pytest.mark.timeout(2700)
 def test_page_leads_from_parts_to_a_goal_in_a_building_that_nobody_had_mapped(person):
     for command in commands():
         LOG.info(command)
@@ -374,15 +415,16 @@ def require_like_the_building(person: Person) -> None:
     """95 % of the walls of the map within 5 cm of those of the building; one free room with a core in it, as there."""
     made = load_map(person.folder / "floor.yaml")
     walls = made.geometry.centres(np.argwhere(made.cells == LETHAL)[:, ::-1].astype(np.int64))
-    away = distance_transform_edt(person.truth.cells != LETHAL) * CELL_M
+    cell_m = person.truth.geometry.resolution
+    away = distance_transform_edt(person.truth.cells != LETHAL) * cell_m
     # The map lies as the first scan does, which may be turned by some thousandths of a radian.
     marks = [np.array(person.mark) + np.array((0.0, 0.0, turn)) for turn in np.linspace(-0.01, 0.01, 11)]
     off = min((person.truth.geometry.sample(away, place(mark, walls), 2.0) for mark in marks), key=np.mean)
     assert len(walls) > 300
-    assert (off <= 0.05 + CELL_M / 2).mean() >= 0.95
+    assert (off <= 0.05 + cell_m / 2).mean() >= 0.95
     free = made.cells == FREE
     assert np.bincount(label(free)[0][free]).max() > 0.97 * free.sum(), "all that is free hangs together"
-    core = between(np.array(person.mark), np.array((4.2, 3.2, 0.0)))[:2]
+    core = between(np.array(person.mark), np.array((*person.building.core, 0.0)))[:2]
     column, row = made.geometry.cell(*core)
     assert made.cells[row, column] != FREE
 
@@ -392,4 +434,4 @@ def require_at(person: Person, goal: str) -> None:
     found = re.search(rf"\[places\.{goal}\].*?x = (\S+)\ny = (\S+)", text, re.DOTALL)
     x, y = map(float, found.groups())
     there = place(np.array(person.mark), np.array([[x, y]]))[0]
-    wait_for(lambda: math.dist(person.pose()[:2], there) < 0.3, f"the robot is at {goal}", WAIT_S)
+    wait_for(lambda: math.dist(person.pose()[:2], there) < 0.3, f"the robot is at {goal}", LEG_S)

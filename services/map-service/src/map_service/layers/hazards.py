@@ -69,6 +69,8 @@ class HazardsLayer(CostLayer):
         self._removed: dict[str, HazardArea] = {}
         self._last_of_removed: dict[str, tuple[int, int]] = {}
         """Epoch and seq of the last hazard of each removed area: neither it nor one before it is another area's."""
+        self._unlisted: set[str] = set()
+        """Which of them were not said to be removed: a heartbeat did not list them, and may have come late."""
         self._lower: dict[str, AreaDefinition] = {}
         """Definitions by newer aggregators with versions below the known ones: they count if the sender is complete."""
         self._fence = Fence()
@@ -124,6 +126,7 @@ class HazardsLayer(CostLayer):
         if old is not None and definition == old.definition:
             return []
         if definition.removed:
+            self._unlisted.discard(definition.id)
             return self._remove(definition.id)
         mask = rasterize(normalized_polygon(definition.polygon), self._geometry)
         if old is None:
@@ -151,7 +154,7 @@ class HazardsLayer(CostLayer):
         old = self._received.get(hazard.area)
         last_of_removed = self._last_of_removed.get(hazard.area, (0, 0))
         outdated = hazard.epoch == last_of_removed[0] and hazard.seq <= last_of_removed[1]
-        if outdated and not self.aggregator.confirms(hazard, at.now):  # else a late heartbeat had removed the area
+        if outdated and not (hazard.area in self._unlisted and self.aggregator.confirms(hazard, at.now)):
             return []
         if old is not None:
             if hazard.epoch == old.epoch and hazard.seq <= old.seq:
@@ -171,6 +174,7 @@ class HazardsLayer(CostLayer):
             # What a newer aggregator has defined, which is not believed yet, this one can't know.
             gone = [name for name, area in self._areas.items() if name not in listed and area.defined_by <= epoch]
             changed = [p for name in gone for p in self._remove(name)]
+            self._unlisted.update(gone)
             own = [d for d in self._lower.values() if d.epoch == self.aggregator.epoch]
             changed += [p for definition in own for p in self._announced(definition, at)]
             self._received = {n: hazard for n, hazard in self._received.items() if n in listed or n in self._areas}

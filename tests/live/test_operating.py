@@ -85,7 +85,7 @@ def test_walk_through_a_running_demo_works_as_the_readme_says(tmp_path):
     terminal = Terminal(tmp_path / "runtime", dict(os.environ))
     printed = tmp_path / "demo.txt"
     arguments = (*terminal.arguments(start), *speed())
-    demo = programs.start("fognav", terminal.environment, printed, *arguments, leads=True, forks=True)
+    demo = programs.start("fognav", terminal.environment, printed, *arguments, forks=True)
     try:
         zone = wait_for(r"^draw a zone: (.+)$", printed, demo)
         wait_for("^planner: plan 1", printed, demo)

@@ -236,6 +236,7 @@ def bridged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
 def test_bridge_is_kept_running_and_the_console_leads_to_it(bridged):
     node = bridged
     asyncio.run(told_home_assistant(node, ch.ONLINE))
+    node.wait(lambda: "bridge" in node.systems()["estig"]["pids"], "it is registered")
     bridge = node.systems()["estig"]["pids"]["bridge"]
     os.kill(bridge, signal.SIGKILL)
     node.wait(lambda: node.systems()["estig"]["pids"].get("bridge", bridge) != bridge, "it is started again")

@@ -102,7 +102,7 @@ def fork_supervised() -> Iterator[None]:
             return await launch(program)
         # Not on the loop's thread: it waits until the parent has its imports.
         request = program.arguments[2], program.environment, program.log
-        starting = asyncio.ensure_future(asyncio.to_thread(start, *request, leads=True))
+        starting = asyncio.ensure_future(asyncio.to_thread(start, *request))
         try:
             return _Supervised(await asyncio.shield(starting))
         except asyncio.CancelledError:
@@ -137,18 +137,16 @@ class _Supervised:
         return self._program.wait()
 
 
-def start(
-    module: str, environment: Mapping[str, str], log: Path, *arguments: str, leads: bool = False, forks: bool = False
-) -> Program:
+def start(module: str, environment: Mapping[str, str], log: Path, *arguments: str, forks: bool = False) -> Program:
     """Start `python -m module`; its output is appended to `log`.
 
-    It `leads` a session of its own, or none; and `forks` what it supervises, as within `fork_supervised`.
+    It `forks` what it supervises, as within `fork_supervised`.
     Raises ValueError for a variable that Python or numba would have read before the fork; PYTHONPATH is respected.
     """
     with log.open("ab") as file:
         request = {
             "module": module, "environment": dict(environment), "in": str(Path.cwd()), "arguments": arguments,
-            "leads": leads, "forks": forks,
+            "forks": forks,
         }  # fmt: skip
         return _start(request, file, file)
 
@@ -317,8 +315,8 @@ def main() -> None:
         sys.dont_write_bytecode = bool(environment.get("PYTHONDONTWRITEBYTECODE"))
         if environment.get("PYTHONUNBUFFERED"):
             sys.stdout.reconfigure(write_through=True)
-        if request.get("leads"):
-            os.setsid()
+        # Linux gives each session its share of the processor: in that of their parent all simulators shared one.
+        os.setsid()
         os.chdir(request["in"])
         time.tzset()
         with fork_supervised() if request.get("forks") else contextlib.nullcontext():

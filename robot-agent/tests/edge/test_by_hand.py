@@ -7,11 +7,13 @@ import os
 import pty
 import select
 import signal
+import socket
 import stat
 import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import programs
 import pytest
@@ -19,6 +21,8 @@ from agent_rig import ROBOT, SITE, Body, Robot, until
 from guardian_rig import Process, Watchdog, lateness, wait_for
 from secured_servers import secured_router
 
+from fog_runtime.clock import SystemClock
+from robot_agent.agent.edges.local_tools import LocalTools
 from robot_agent.agent.local_link import Missed
 from robot_agent.agent.recording.input_log import BaseReceived, Published, ScanReceived, Started
 from robot_agent.local_client import LocalRobot, LocalRobotError
@@ -96,6 +100,22 @@ class Watcher:
     def state(self) -> dict | None:
         states = self.seen.get(Published)
         return states[-1].message if states else None
+
+
+async def test_tool_that_leaves_at_once_is_forgotten_without_an_error(tmp_path):
+    core = SimpleNamespace(on_hand=lambda *_: None)
+    tools = LocalTools(tmp_path / "agent.sock", Missed(count=1), lambda: Missed(count=2), core, SystemClock())
+    problems = []
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, problem: problems.append(problem))
+    serving = asyncio.create_task(tools.run())
+    await asyncio.sleep(0)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as tool:
+        tool.connect(str(tmp_path / "agent.sock"))
+    await asyncio.sleep(0.1)
+    serving.cancel()
+    await asyncio.gather(serving, return_exceptions=True)
+    assert problems == []
+    assert not tools.watched
 
 
 @pytest.fixture(scope="module")

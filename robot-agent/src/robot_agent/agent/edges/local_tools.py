@@ -178,6 +178,8 @@ class LocalTools:
 
     def _drop(self, client: _Client) -> None:
         """Forget a client; if it drove the robot by hand, the robot stops."""
+        if client.link.fileno() < 0:
+            return  # gone before all of a new client's first entries were sent
         self._clients.pop(client.link.fileno(), None)
         asyncio.get_running_loop().remove_reader(client.link)
         client.link.close()

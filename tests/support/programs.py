@@ -11,6 +11,7 @@ type a hundred.
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import errno
 import fcntl
@@ -213,11 +214,21 @@ def _parent(module: str) -> socket.socket:
                 )
             )
         link.connect(name)
+    _links.append(link)
     return link
 
 
+_links: list[socket.socket] = []
 _started: list[subprocess.Popen[bytes]] = []
 """Parents that this process has started. They end after the run, which waits for none of them."""
+
+
+@atexit.register
+def _leave() -> None:
+    for link in _links:
+        link.close()
+    for process in _started:
+        process.returncode = 0  # else Python warns of each that it still runs
 
 
 class _Parent:

@@ -215,7 +215,8 @@ class Person:
             return [sys.executable, "-m", "fognav", *words[1:]]
         return [str(ROOT / words[0]), *words[1:], "--root", str(self.root)]
 
-    def run(self, command: str) -> str:
+    def run(self, command: str, *, narrow: bool = False) -> str:
+        """Run a command of the page; with `narrow` it may fail if all that it names is narrow."""
         environ = self.installed() if command.startswith(("fognav", "sudo fognav")) else self.environment
         done = subprocess.run(
             self.words(command),
@@ -226,7 +227,9 @@ class Person:
             timeout=WAIT_S,
             check=False,
         )
-        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+        named = done.stdout.splitlines()
+        accepted = narrow and done.returncode == 1 and all(line.startswith("narrow:") for line in named)
+        assert done.returncode == 0 or accepted, f"{command}\n{done.stdout}{done.stderr}"
         return done.stdout
 
     def record(self, command: str) -> None:
@@ -397,7 +400,7 @@ def test_page_leads_from_parts_to_a_goal_in_a_building_that_nobody_had_mapped(pe
             person.run(command)
             person.start_robot()
         else:
-            told = person.run(command)
+            told = person.run(command, narrow="map check" in command)
             if "robot new" in command:
                 person.measure(person.folder / "robot.toml")
     settings = (person.root / "etc/fognav/robot.toml").read_text("utf-8")
@@ -413,7 +416,7 @@ def test_page_leads_from_parts_to_a_goal_in_a_building_that_nobody_had_mapped(pe
 
 def require_like_the_building(person: Person) -> None:
     """95 % of the walls of the map within 5 cm of those of the building; one free room with a core in it, as there."""
-    made = load_map(person.folder / "floor.yaml")
+    made = load_map(person.folder / "floor-clean.yaml")
     walls = made.geometry.centres(np.argwhere(made.cells == LETHAL)[:, ::-1].astype(np.int64))
     cell_m = person.truth.geometry.resolution
     away = distance_transform_edt(person.truth.cells != LETHAL) * cell_m

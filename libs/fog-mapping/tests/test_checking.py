@@ -8,6 +8,7 @@ import pytest
 from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_mapping.checking import check_cells
+from fog_mapping.cleaning import clean, read
 
 CELL = 0.05
 
@@ -63,6 +64,15 @@ def test_specks_on_free_floor_are_counted_and_a_leg_of_a_table_is_none():
     (one,) = check_cells(static, 0.17)
     assert one.kind == "speckles"
     assert one.places == [pytest.approx(place, abs=0.01) for place in ((3.025, 2.025), (7.525, 3.525))]
+
+
+def test_cleaning_by_the_words_that_are_found_leaves_nothing_to_find_and_changes_nothing_else():
+    static = two_rooms(0.9)
+    static.cells[40, 60] = static.cells[70, 150] = LETHAL
+    static.cells[cells(5.2, 5.8), cells(1, 2)] = FREE
+    assert set(found(static)) == {"island", "speckles"}
+    cleaned = clean(read("speckles\nislands").commands, static).map
+    assert np.array_equal(cleaned.cells, two_rooms(0.9).cells)
 
 
 @pytest.mark.parametrize(("value", "name"), [(FREE, "free"), (LETHAL, "occupied"), (UNKNOWN, "unknown")])

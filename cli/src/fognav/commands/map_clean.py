@@ -55,9 +55,9 @@ def map_clean(
 ) -> None:
     """Clean a map by the commands of a text file, and write the result as another map.
 
-    Commands: straighten [degrees]; crop, erase, block, freeze LEFT BOTTOM RIGHT TOP; wall X Y X Y ...; free, unknown
-    X Y X Y X Y ... (m). They hold in the frame of the file's first map: the map of a new recording is laid onto that by
-    matching of walls, and refused if it doesn't fit (exit code 1).
+    Commands: straighten [degrees]; speckles; islands; crop, erase, block, freeze LEFT BOTTOM RIGHT TOP; wall X Y X Y
+    ...; free, unknown X Y X Y X Y ... (m). They hold in the frame of the file's first map: the map of a new recording
+    is laid onto that by matching of walls, and refused if it doesn't fit (exit code 1).
     """
     with exit_codes():
         if onto is not None and commands is not None:

@@ -135,7 +135,7 @@ def _islands(where: _Places, labels: NDArray[np.int32], sizes: NDArray[np.int64]
         yield Finding(
             "island",
             f"{len(others)} free islands ({area:.1f} m2) are joined to the rest by no free floor",
-            "Open the way (free), or fill them (unknown), by fognav map clean",
+            "Open the way (fognav map clean MAP.yaml free ...), or leave all out: fognav map clean MAP.yaml islands",
             places,
         )
 
@@ -165,23 +165,43 @@ def _narrow(where: _Places, main: NDArray[np.bool_], radius: float) -> Iterator[
 
 
 def _specks(where: _Places, cells: NDArray[np.uint8]) -> Iterator[Finding]:
-    labels, count = ndimage.label(cells == LETHAL, _ALL_AROUND)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    small = np.flatnonzero(sizes <= _SPECK_CELLS)
-    small = small[small > 0]
-    if not len(small):
-        return
-    # Only what stands amid free floor: dots between unknown cells are in nobody's way.
-    unfree = ndimage.maximum_filter((cells == UNKNOWN).astype(np.uint8), 3)
-    lone = small[ndimage.maximum(unfree, labels, small) == 0].tolist()
+    labels, lone = _labelled_specks(cells)
     if lone:
         centres = ndimage.center_of_mass(np.ones_like(labels), labels, lone[:_NAMED])
         yield Finding(
             "speckles",
             f"{len(lone)} specks of {_SPECK_CELLS} cells or fewer stand on free floor",
-            "Are they people or noise? Erase them: fognav map clean MAP.yaml erase ...",
+            "Are they people or noise? Erase all: fognav map clean MAP.yaml speckles",
             [where.place(row, column) for row, column in centres],
         )
+
+
+def _labelled_specks(cells: NDArray[np.uint8]) -> tuple[NDArray[np.int32], list[int]]:
+    """Return labels of what is occupied, and those of the specks."""
+    labels, count = ndimage.label(cells == LETHAL, _ALL_AROUND)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    small = np.flatnonzero(sizes <= _SPECK_CELLS)
+    small = small[small > 0]
+    if not len(small):
+        return labels, []
+    # Only what stands amid free floor: dots between unknown cells are in nobody's way.
+    unfree = ndimage.maximum_filter((cells == UNKNOWN).astype(np.uint8), 3)
+    return labels, small[ndimage.maximum(unfree, labels, small) == 0].tolist()
+
+
+def specks(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return where a map's specks are: single occupied cells or pairs amid free floor."""
+    labels, lone = _labelled_specks(cells)
+    return np.isin(labels, lone)
+
+
+def islands(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return where a map's free floor is that no free floor joins to the largest part."""
+    labels, _ = ndimage.label(cells == FREE)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    outside: NDArray[np.bool_] = (labels > 0) & (labels != int(np.argmax(sizes)))
+    return outside
 
 
 def odd_resolution(resolution: float) -> str | None:

@@ -10,6 +10,8 @@
     freeze 20 0 25 5                # keeps the first map's cells there in a later recording
     free 1 1 4 1 4 3                # makes a polygon free
     unknown 61 0 70 0 70 9 61 9     # makes a polygon unknown: what was seen through windows
+    speckles                        # makes single occupied cells and pairs amid free floor free: people, noise
+    islands                         # makes free floor unknown that no free floor joins to the largest part
 
 Coordinates are those of the map as the lines above it leave it. To undo a command, delete its line.
 """
@@ -28,6 +30,7 @@ from fog_contracts.grid import GridGeometry, StaticMap, Window
 from fog_contracts.resampling import resampled
 from fog_contracts.shapes import rasterize, rasterize_line
 from fog_mapping.alignment import Alignment, align, laid_onto, wall_points
+from fog_mapping.checking import islands, specks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,6 +47,8 @@ _FORMS: Final = {
     "wall": "x y x y ...",
     "free": "x y x y x y ...",
     "unknown": "x y x y x y ...",
+    "speckles": "",
+    "islands": "",
 }
 _FIRST_MAP: Final = "map"
 _FINGERPRINT_DIGITS: Final = 12
@@ -112,7 +117,7 @@ def _command(line: int, words: Sequence[str]) -> Command:
     word = words[0]
     if word not in _FORMS:
         raise CommandError(line, f"{word!r} is no command", f"Use one of {', '.join(_FORMS)}")
-    remedy = f"Write: {word} {_FORMS[word]}"
+    remedy = f"Write: {word} {_FORMS[word]}".rstrip()
     try:
         numbers = tuple(float(text) for text in words[1:])
     except ValueError:
@@ -128,8 +133,9 @@ def _command(line: int, words: Sequence[str]) -> Command:
 def _problem(word: str, numbers: tuple[float, ...]) -> str | None:
     """Return why a command can't have these numbers, or None."""
     count = len(numbers)
-    if word == "straighten":
-        return f"there are {count} angles" if count > 1 else None
+    most = 1 if word == "straighten" else 0 if not _FORMS[word] else None
+    if most is not None:
+        return f"there are {count} numbers, and at most {most} is of use" if count > most else None
     if _FORMS[word] == _RECTANGLE:
         if count != 4:
             return f"a rectangle has 4 numbers, not {count}"
@@ -209,6 +215,9 @@ def _sum_of_quarters(normals: NDArray[np.float64]) -> tuple[float, float]:
 def _changed(command: Command, static: StaticMap, first: StaticMap) -> StaticMap:
     _, word, numbers = command
     geometry = static.geometry
+    if not _FORMS[word]:
+        found, becomes = (specks, FREE) if word == "speckles" else (islands, UNKNOWN)
+        return StaticMap(geometry, np.where(found(static.cells), np.uint8(becomes), static.cells))
     if word in {"wall", "free", "unknown"}:
         points = list(zip(numbers[::2], numbers[1::2], strict=True))
         reach = _THICK_CELLS * geometry.resolution

@@ -160,7 +160,7 @@ def _flip_test(differences: _Floats) -> float:
 
 COLOURS: Final = {
     "default": "#d9822b", "lean": "#8a6d3b", "full": "#3b7dd8", "fog": "#2a9d5c", "lockstep": "#9a9a9a",
-    "live": "#7a4fb5", "hardware": "#444444",
+    "live": "#7a4fb5", "hardware": "#444444", "fog, learned": "#a3d9a5",
 }  # fmt: skip
 """Colours of the setups, of which `default` and `full` are the thesis's, and of how a drive was made."""
 _SAVED: Final = LinearSegmentedColormap.from_list("saved", [COLOURS["default"], "white", COLOURS["fog"]])

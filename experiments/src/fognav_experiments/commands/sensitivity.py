@@ -139,7 +139,7 @@ def people_command(
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fog_runtime.files import SHARED, atomic_write  # noqa: PLC0415  # same
     from fognav_experiments.comparison import people as among  # noqa: PLC0415  # same
-    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison import people_page, runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import DriveFiles, Folder, FolderError  # noqa: PLC0415  # same
 
     command = f"fognav experiment people --people {people} --runs {runs} --seed {seed} --out DIR"
@@ -162,7 +162,7 @@ def people_command(
         found = [drive for drive in files.read() if drive.name in names]
         measured = folder.description()["measured_on"]
         atomic_write(folder.path / among.ARCHIVE, files.pack({"measured_on": measured}), mode=SHARED)
-        for file in among.publish(found, command, measured, folder.path):
+        for file in people_page.publish(found, command, measured, folder.path):
             print_line(str(file))
     if failed:
         raise typer.Exit(NOT_TRUE)

@@ -11,7 +11,7 @@ from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -19,42 +19,30 @@ import numpy as np
 from fog_contracts.cones import sonar_cones
 from fog_contracts.geometry import contains_point, distance_to_polygon
 from fog_contracts.messages import ReasonCode
-from fog_runtime.files import SHARED, atomic_write
 from fognav_experiments.comparison.drives import ALONE, PROFILE_OF_SETUP, DrivenRoute, draw, ends_of, start_of
-from fognav_experiments.figures import (
-    Block,
-    Code,
-    Heading,
-    Paragraph,
-    Picture,
-    Table,
-    bars,
-    captioned,
-    clustered,
-    flat,
-    spread,
-    to_markdown,
-    told,
-)
 from fognav_experiments.lockstep import ready, release_drives
 from fognav_experiments.machine import results
 from fognav_sim.drive.drive import DriveOutcome
 from fognav_sim.hardware import STEP_S
-from fognav_sim.people import BODY_M, FROM_ROBOT_M, SPEED_M_S, STANDS_S, People
+from fognav_sim.people import BODY_M, People
 from fognav_sim.people import STEP_S as PEOPLE_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.drives import ExperimentSpec, RouteDraw, Setup
     from fognav_experiments.comparison.records import DriveFiles
-    from fognav_experiments.figures import Estimate
     from fognav_experiments.lockstep import LockstepDrive
+    from planner.waits.blocks import BlockRecord
 
-SETUPS: Final[tuple[Setup, ...]] = ("fog", "lean")
-"""A robot that the fog leads, and the control: one on its own at the same rates."""
+_LATER_SEED: Final = 1_000_003
+"""What a drive's seed is raised by for the drive before it, which has other people."""
+KINDS: Final[tuple[tuple[Setup, bool], ...]] = (("fog", False), ("fog", True), ("lean", False))
+"""A robot that the fog leads, the same whose planner has learned for how long blocks last, and the control: one on its
+own at the same rates."""
+ARCHIVE: Final = "people.jsonl.xz"
+"""All records: drives go on from it."""
 MISSED_S: Final = 2.0
 """Who stands in an area for longer than this should be reported: confirming takes up to about half a second."""
 EGRESS_S: Final = 5.0
@@ -94,9 +82,11 @@ class PeopleDrive(DrivenRoute, frozen=True, kw_only=True):
     `closest_moving_m` while the robot moved. `contacts`: of the robot with anybody or anything, as far as it drove into
     them. `stood_s`: how long (s) it stood on its way. `modes`: how often it entered each mode, `modes_s`: for how long
     (s). `stops`: its protective stops and faults; `egresses`: how often an operator let it out of a blocked area.
+    `learned`: its planner has seen the blocks of the same drive among other people before.
     """
 
     people: int
+    learned: bool = False
     reason: str
     closest_m: float | None
     closest_moving_m: float | None
@@ -115,7 +105,7 @@ class PeopleDrive(DrivenRoute, frozen=True, kw_only=True):
     @property
     def name(self) -> str:
         """Name of the record's file, without suffix."""
-        return PeopleTask.named(self.run, self.route, self.setup, self.people)
+        return PeopleTask.named(self.run, self.route, self.setup, self.people, learned=self.learned)
 
 
 class PeopleTask(NamedTuple):
@@ -124,22 +114,29 @@ class PeopleTask(NamedTuple):
     drawn: RouteDraw
     setup: Setup
     people: int
+    learned: bool = False
 
     @property
     def name(self) -> str:
         """Name of its record."""
-        return self.named(self.drawn.run, self.drawn.route.name, self.setup, self.people)
+        return self.named(self.drawn.run, self.drawn.route.name, self.setup, self.people, learned=self.learned)
 
     @staticmethod
-    def named(run: int, route: str, setup: str, people: int) -> str:
+    def named(run: int, route: str, setup: str, people: int, *, learned: bool) -> str:
         """Return the name of a drive's record."""
-        return f"{run:04}-{route}-{setup}-{people:02}"
+        return f"{run:04}-{route}-{setup}{'-learned' * learned}-{people:02}"
 
 
 def people_tasks(spec: ExperimentSpec, seed: int, runs: int, counts: Sequence[int]) -> list[PeopleTask]:
     """Return the drives, run by run: each is of the site's first route, with a heading and noise of its own."""
     drawn = [draw(spec, seed, run)[0] for run in range(1, runs + 1)]
-    return [PeopleTask(route, setup, count) for route in drawn for count in counts for setup in SETUPS]
+    return [
+        PeopleTask(route, setup, count, learned)
+        for route in drawn
+        for count in counts
+        for setup, learned in KINDS
+        if count or not learned
+    ]
 
 
 @dataclass
@@ -250,6 +247,22 @@ def people_drives(
 
 def people_drive(site: LoadedSite, commit: str, task: PeopleTask) -> PeopleDrive:
     """Drive one task in lockstep; the same whenever it is repeated."""
+    learned: dict[str, BlockRecord] = {}
+    if task.learned:
+        earlier = msgspec.structs.replace(task.drawn, seed=task.drawn.seed + _LATER_SEED)
+        _, run = _driven(site, task._replace(drawn=earlier), commit, {})
+        records = run.system.fog.planner.core.waits.blocks.to_store(run.now)
+        learned = {area: msgspec.structs.replace(record, standing=None) for area, record in records.items()}
+        release_drives()
+    drive, _ = _driven(site, task, commit, learned)
+    release_drives()
+    return drive
+
+
+def _driven(
+    site: LoadedSite, task: PeopleTask, commit: str, learned: Mapping[str, BlockRecord]
+) -> tuple[PeopleDrive, LockstepDrive]:
+    """Drive a task with a planner that knows how long blocks lasted; return the drive, and what drove."""
     drawn = task.drawn
     run = ready(
         site,
@@ -262,17 +275,17 @@ def people_drive(site: LoadedSite, commit: str, task: PeopleTask) -> PeopleDrive
     drive = run.drive
     assert drive is not None
     outcome = None if run.problem is None else DriveOutcome("stopped", run.problem)
+    run.system.fog.planner.core.waits.blocks.restore(learned, run.now)
     among = _Among(site, run, task)
     while outcome is None:
         among.step()
         outcome = drive.outcome(run.now)
     result = run.result(drive, outcome)
-    release_drives()
     told_by_drive = (
         "reason", "success", "outcome", "distance_m", "time_s", "contacts", "min_clearance_m", "paths", "route_areas",
         "modes", "stops", "operator_commands",
     )  # fmt: skip
-    return PeopleDrive(
+    told_of = PeopleDrive(
         **{name: getattr(result, name) for name in told_by_drive},
         setup=task.setup,
         run=drawn.run,
@@ -280,6 +293,7 @@ def people_drive(site: LoadedSite, commit: str, task: PeopleTask) -> PeopleDrive
         seed=drawn.seed,
         area="",
         people=task.people,
+        learned=task.learned,
         closest_m=_finite(among.closest_m),
         closest_moving_m=_finite(among.closest_moving_m),
         stood_s=round(among.stood_s, 2),
@@ -289,6 +303,7 @@ def people_drive(site: LoadedSite, commit: str, task: PeopleTask) -> PeopleDrive
         commit=commit,
         version=version("fognav-experiments"),
     )
+    return told_of, run
 
 
 class _Among:
@@ -349,100 +364,3 @@ class _Among:
 
 def _finite(value: float) -> float | None:
     return round(value, 3) if math.isfinite(value) else None
-
-
-ARCHIVE: Final = "people.jsonl.xz"
-"""All records: drives go on from it."""
-_WORDS: Final = """\
-A robot drives from A to B among people, who walk by the social-force model of Helbing and Molnár \
-(*Physical Review E* 51, 4282, 1995) with its parameters: {speed} ± {spread} m/s (at most 1.3 times as fast as \
-somebody likes), relaxation 0.5 s, others 2.1 m²/s² and 0.3 m, walls 10 m²/s² and 0.2 m, 200° of sight and half of \
-that weight behind. Others are thought to be ahead by 1 s, in which open implementations of the paper differ. The \
-rest is our own: people go from anywhere on the floor to anywhere, stand there for {stands:g} s on average, and give \
-way to nobody then; who walks makes room for the robot as for a person, and comes no nearer than {near} m by himself. \
-They are round, 0.4 m wide, and echo as the simulator's boxes do. Each run draws others, the same in both setups. \
-`fog` is led by the fog; `lean`, the control, drives on its own at the same rates. In `fog` the planner has seen no \
-block before, so that it sends the robot round. *Operator* counts commands after the first enable; after {egress:g} s \
-in an area that stays blocked round the robot one is to let it out."""
-_OF_NODES: Final = """\
-*By passers-by*: blocks during which nobody stood in the area. *Missed*: who stood in a watched area for more than \
-{missed:g} s while it was never blocked; in brackets those of them who stood in a cone. *More* is against the same \
-drive without people. *Stops* are protective stops, *holds* those on the way. *Closest* is the least distance between \
-the robot's rim and a person in a drive while the robot moved: median, least and most."""
-_HEADER: Final = (
-    "people", "setup", "drives, arrived", "m more", "s more", "s stood", "stops", "holds", "operator", "closest, m",
-    "contacts", "blocks", "by passers-by", "walked through cones (reported)", "stood in areas (in cones)",
-    "missed (in cones)",
-)  # fmt: skip
-
-
-def publish(drives: Sequence[PeopleDrive], command: str, measured_on: Mapping[str, Any], target: Path) -> list[Path]:
-    """Write page and figure into a folder; return the files."""
-    counts = sorted({drive.people for drive in drives})
-    words = _WORDS.format(speed=SPEED_M_S[0], spread=SPEED_M_S[1], stands=STANDS_S, near=FROM_ROBOT_M, egress=EGRESS_S)
-    seconds: dict[str, list[Estimate | None]] = {
-        setup: [_seconds(_cell(drives, count, setup)) for count in counts] for setup in SETUPS
-    }
-    shown = [found for line in seconds.values() for found in line]
-    picture = Picture(
-        "seconds.svg",
-        bars("A drive among people", "s", [str(count) for count in counts], seconds),
-        captioned("Seconds that a drive takes, by how many people are on the floor", shown),
-    )
-    blocks: list[Block] = [
-        Heading("People in beams and paths", 1),
-        Paragraph(words),
-        Code(command),
-        picture,
-        Table(_HEADER, [row for count in counts for setup in SETUPS if (row := _row(drives, count, setup))]),
-        Paragraph(_OF_NODES.format(missed=MISSED_S)),
-    ]
-    if failed := [[drive.name, drive.outcome, drive.reason] for drive in drives if not drive.success]:
-        blocks += [Paragraph("Drives that failed, and count in no mean:"), Table(["drive", "outcome", "why"], failed)]
-    commits = Counter(drive.commit for drive in drives)
-    blocks.append(Paragraph(f"Drives by commit: {', '.join(f'{n} at {commit}' for commit, n in commits.items())}."))
-    blocks.append(Table(["measured on", ""], [[name, str(value)] for name, value in flat(measured_on)]))
-    files = {"README.md": to_markdown(blocks).encode(), picture.file: picture.svg.encode()}
-    for name, content in files.items():
-        atomic_write(target / name, content, mode=SHARED)
-    return [target / name for name in files]
-
-
-def _cell(drives: Sequence[PeopleDrive], count: int, setup: Setup) -> list[PeopleDrive]:
-    return [drive for drive in drives if (drive.people, drive.setup) == (count, setup)]
-
-
-def _seconds(cell: Sequence[PeopleDrive]) -> Estimate | None:
-    took = [(drive.time_s, drive.run) for drive in cell if drive.success and drive.time_s is not None]
-    return clustered([time_s for time_s, _ in took], [run for _, run in took]) if took else None
-
-
-def _row(drives: Sequence[PeopleDrive], count: int, setup: Setup) -> list[str]:
-    """Return a row of the table; none without a drive."""
-    cell = _cell(drives, count, setup)
-    if not cell:
-        return []
-    free = {drive.run: drive for drive in _cell(drives, 0, setup) if drive.success}
-    pairs = [(drive, free[drive.run]) for drive in cell if drive.success and drive.run in free]
-    metres = [drive.distance_m - empty.distance_m for drive, empty in pairs]
-    seconds = [(drive.time_s or 0.0) - (empty.time_s or 0.0) for drive, empty in pairs]
-    more = [told(values, [drive.run for drive, _ in pairs]) if count and pairs else "-" for values in (metres, seconds)]
-    closest = [drive.closest_moving_m for drive in cell if drive.closest_moving_m is not None]
-    of = [drive.episodes for drive in cell]
-    nodes = [
-        str(sum(each.blocks for each in of)),
-        str(sum(each.passing + each.empty for each in of)),
-        f"{sum(each.passed for each in of)} ({sum(each.passed_reported for each in of)})",
-        f"{sum(each.stood for each in of)} ({sum(each.stood_seen for each in of)})",
-        f"{sum(each.missed for each in of)} ({sum(each.missed_seen for each in of)})",
-    ]
-    return [
-        str(count), setup, f"{len(cell)}, {sum(drive.success for drive in cell)}", *more,
-        f"{np.mean([drive.stood_s for drive in cell]):.1f}",
-        str(sum(drive.modes.get("PROTECTIVE_STOP", 0) for drive in cell)),
-        str(sum(drive.modes.get("HOLD", 0) for drive in cell)),
-        str(sum(drive.operator_commands - 1 + drive.egresses for drive in cell)),
-        spread(closest) if closest else "-",
-        str(sum(drive.contacts for drive in cell)),
-        *(nodes if setup not in ALONE else ["-"] * len(nodes)),
-    ]  # fmt: skip

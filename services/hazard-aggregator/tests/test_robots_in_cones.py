@@ -52,13 +52,17 @@ def test_echo_of_a_robot_in_the_cone_does_not_clear_a_blocked_area():
     assert rig.hazard.state == "blocked"
 
 
-def test_area_is_clear_again_when_somebody_has_walked_between_the_node_and_a_robot():
+@pytest.mark.parametrize("stood", [12, 80])  # the second: for longer than the robot explains echoes
+def test_area_is_clear_again_when_somebody_has_walked_between_the_node_and_a_robot(stood):
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
-    for seen, expected in ((0.83, "clear"), (0.45, "blocked"), (0.83, "clear")):
-        read_beside_robot(rig, pose(1.0, 0.5), (seen, 3.0), times=12)
+    before = "clear" if stood == 12 else "unknown"
+    for seen, times, expected in ((0.83, stood, before), (0.45, 12, "blocked"), (0.83, 12, "clear")):
+        read_beside_robot(rig, pose(1.0, 0.5), (seen, 3.0), times=times)
         assert rig.hazard.state == expected
     assert rig.hazard.explained_by == "r1"
+    read_beside_robot(rig, pose(1.0, 0.5), (0.83, 3.0), times=80)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200)
 
 
 @pytest.mark.parametrize(

@@ -199,9 +199,12 @@ class Planner:
     def __init__(self, robots: list[str] | None) -> None:
         self.robots = robots
         self.stopped: list[str] = []
+        self.asked = 0
         self.first_stop = asyncio.Event()
 
     async def readiness(self) -> dict[str, str]:
+        self.asked += 1
+        await asyncio.sleep(0)
         return {}
 
     async def send(self, service, request, target, _body):
@@ -234,6 +237,15 @@ async def test_stop_is_acknowledged_only_by_who_knows_all_robots_and_known_ones_
     assert (planner.stopped, [each.id for each in stop.robots]) == (stopped, stopped)
     assert (stop.acknowledged, remedy in stop.detail) == (not remedy, True)
     assert not remedy or "press again" in stop.detail
+
+
+async def test_services_are_asked_once_a_second_however_many_floors_ask():
+    times, planner = [], Planner([])
+    floor = OwnFloor(ConsoleCore("lab", "r"), planner, Health("zenoh"), lambda: times[-1])
+    for now, asked in ((100.0, 1), (100.9, 1), (101.0, 2)):
+        times.append(now)
+        await asyncio.gather(*(floor.view() for _ in range(50)))
+        assert planner.asked == asked
 
 
 @pytest.mark.parametrize("dead", [0, 1])

@@ -4,6 +4,8 @@ Sensor nodes flip areas and robots send poses ten times a second (`bench.pipelin
 own (`python -m fognav_experiments.bench.console`), each with a login and a connection; some of them take the events
 apart, and compare the stamps of their publication with the time of their arrival. Another process times the map's
 heartbeat (`bench.rest`): with and without readers, as only the two together mean something on a busy machine.
+
+The same for a list of many floors: another process answers for each of them, and asks this one as some of them do.
 """
 
 from __future__ import annotations
@@ -11,22 +13,24 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
 import psutil
 
+from fog_runtime.clock import SystemClock, ticker
 from fog_supervisor.net import LOOPBACK
 from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, CONSOLE, MAP_SERVICE, SERVERS
 from fognav.stack import Stack, StackConfig, StackUsers
-from fognav_experiments.bench.common import SITE
+from fognav_experiments.bench.common import SITE, ask
 from fognav_experiments.bench.pipeline import BENCH, MB, Fog, ended, load_generator, write_nodes
 from fognav_experiments.bench.rest import figures_of, gaps_of, heartbeat_listener
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
     from pathlib import Path
 
 NODES: Final = 40
@@ -37,6 +41,12 @@ _AT_ONCE: Final = 20
 """Readers that connect at the same time."""
 _READY_S: Final = 120.0
 _CONNECTED_S: Final = 300.0
+MOST_ASKERS: Final = 100
+"""How many of the floors at most ask the one that lists them: those of a campus have each other, not all have all."""
+_CONNECTIONS: Final = 20
+"""Over which they ask: one address gets no more than some."""
+_SETTLE_S: Final = 12.0
+"""In which a console has asked a thousand floors twice."""
 
 
 async def measure(
@@ -198,13 +208,137 @@ async def _read(port: str, token: str, readers: int, seconds: float) -> None:
     sys.stdout.buffer.write(msgspec.json.encode(figures) + b"\n")
 
 
-def main() -> None:
-    """Read as the command line says: PORT TOKEN READERS SECONDS.
+async def measure_floors(folder: Path, count: int, seconds: float, on_phase: Callable[[str], object]) -> dict[str, Any]:
+    """Return what a list of so many other floors costs a console-service; `folder` is empty. Raises `FailedError`."""
+    write_nodes(folder, NODES)
+    pipe = asyncio.subprocess.PIPE
+    playing = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        "fognav_experiments.bench.console",
+        "floors",
+        str(count),
+        stdin=pipe,
+        stdout=pipe,
+        limit=1 << 20,
+    )
+    assert playing.stdin is not None
+    assert playing.stdout is not None
+    try:
+        ports = (await playing.stdout.readline()).split()
+        (folder / "there.toml").write_text('user = "bench"\ntoken = "bench"\n', "utf-8")
+        listed = folder / "floors.toml"
+        entries = (
+            f'[floors.f{number}]\naddress = "http://{LOOPBACK}:{int(port)}"\ncredentials = "there.toml"\n'
+            for number, port in enumerate(ports)
+        )
+        listed.write_text("".join(entries), "utf-8")
+        config = StackConfig(
+            site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, console={"FLOORS_FILE": str(listed)}
+        )
+        async with Stack(config) as stack:
+            on_phase(f"{count} floors: starting servers and services of one more")
+            await stack.start_servers(_READY_S)
+            await stack.start_services(_READY_S)
+            playing.stdin.write(f"{stack.port(CONSOLE)} {stack.token}\n".encode())
+            on_phase(f"{count} floors: measuring for {seconds:g} s")
+            await asyncio.sleep(_SETTLE_S)
+            playing.stdin.write(b"begin\n")
+            process = psutil.Process(stack.pids()[CONSOLE])
+            begun, ages, load = _cpu_s(process), [], psutil.getloadavg()[0]
+            until = time.monotonic() + seconds
+            while time.monotonic() < until:
+                answer = await ask(stack, CONSOLE, "GET", "/api/v1/floors")
+                for entry in msgspec.convert(answer.body, list[dict[str, Any]]):
+                    if entry["address"]:
+                        if not entry["reachable"]:
+                            raise FailedError(f"{entry['id']} is not reachable: {entry['detail']}")
+                        ages.append(entry["age_s"])
+                await asyncio.sleep(1.0)
+            used, memory = _cpu_s(process) - begun, process.memory_info().rss
+            playing.stdin.write(b"end\n")
+            out = msgspec.json.decode(await playing.stdout.readline(), type=list[float])
+    finally:
+        if playing.returncode is None:
+            playing.kill()
+        await playing.wait()
+    return {
+        "floors": count,
+        "cpu_percent": round(100 * used / seconds, 1),
+        "rss_mb": round(memory / MB, 1),
+        **{f"age_p{p}_s": round(float(np.percentile(ages, p)), 1) for p in (50, 99)},
+        "answers": len(out),
+        **{f"answer_p{p}_ms": round(1000 * float(np.percentile(out, p)), 1) for p in (50, 99)},
+        "load": round(load, 1),
+    }
 
-    Writes `ready` once all have the first state; from the first line of standard input on so many seconds are measured.
+
+async def _play_floors(count: int) -> None:
+    """Answer for so many floors, each at a port of its own; some of them have the one under test in their lists."""
+    took: list[float] = []
+    servers = [await asyncio.start_server(_answering(number), LOOPBACK, 0) for number in range(count)]
+    sys.stdout.write(" ".join(str(server.sockets[0].getsockname()[1]) for server in servers) + "\n")
+    sys.stdout.flush()
+    port, token = (await asyncio.to_thread(sys.stdin.readline)).split()
+    askers = min(count, MOST_ASKERS)
+    connections = min(askers, _CONNECTIONS)
+    async with asyncio.TaskGroup() as tasks:
+        asking = [
+            tasks.create_task(_ask_on(port, token, number / askers, connections / askers, took))
+            for number in range(connections)
+        ]
+        await asyncio.to_thread(sys.stdin.readline)
+        took.clear()
+        await asyncio.to_thread(sys.stdin.readline)
+        for each in asking:
+            each.cancel()
+    sys.stdout.buffer.write(msgspec.json.encode(took) + b"\n")
+    sys.stdout.flush()
+    await asyncio.Event().wait()  # until it is killed, so that no connection ends before
+
+
+def _answering(number: int) -> Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]:
+    robots = [{"id": f"r{each}", "age_s": 0.1, "mode": "NORMAL", "enabled": True, "codes": []} for each in range(5)]
+    view = {"site": f"f{number}", "not_ready": {}, "robots": robots, "blocked": ["a1"], "unknown": [], "stopped": False}
+    body = msgspec.json.encode(view)
+    answer = b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body)
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(asyncio.IncompleteReadError, ConnectionError):
+            while True:
+                await reader.readuntil(b"\r\n\r\n")
+                writer.write(answer)
+        writer.close()
+
+    return serve
+
+
+async def _ask_on(port: str, token: str, begin_s: float, period_s: float, took: list[float]) -> None:
+    await asyncio.sleep(begin_s)
+    reader, writer = await asyncio.open_connection(LOOPBACK, int(port))
+    asked = f"GET /api/v1/floors/here HTTP/1.1\r\nHost: fog\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
+    async for _ in ticker(SystemClock(), period_s):
+        begun = time.monotonic()
+        writer.write(asked)
+        head = await reader.readuntil(b"\r\n\r\n")
+        if not head.startswith(b"HTTP/1.1 200"):
+            raise ConnectionError(head.decode("latin-1"))
+        _, _, length = head.lower().partition(b"content-length:")
+        await reader.readexactly(int(length.partition(b"\r\n")[0]))
+        took.append(time.monotonic() - begun)
+
+
+def main() -> None:
+    """Read as the command line says: PORT TOKEN READERS SECONDS. Or play floors: floors COUNT.
+
+    Readers write `ready` once all have the first state; from the first line of standard input on so many seconds are
+    measured. Floors write their ports, and are told PORT TOKEN of another, when to begin to measure, and when to end.
     """
-    port, token, readers, seconds = sys.argv[1:]
-    asyncio.run(_read(port, token, int(readers), float(seconds)))
+    if sys.argv[1] == "floors":
+        asyncio.run(_play_floors(int(sys.argv[2])))
+    else:
+        port, token, readers, seconds = sys.argv[1:]
+        asyncio.run(_read(port, token, int(readers), float(seconds)))
 
 
 if __name__ == "__main__":

@@ -321,6 +321,10 @@ def rest_command(
 def console_command(
     *,
     readers: Annotated[int, typer.Option("--readers", metavar="N", min=1, max=1024, help="Readers of events.")] = 1000,
+    floors: Annotated[
+        list[int] | None,
+        typer.Option("--floors", metavar="N", min=1, max=1000, help="List so many floors, instead; may be repeated."),
+    ] = None,
     robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=100, help="Robots that drive.")] = 10,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="Of each measurement.")] = 20.0,
     json: JsonOption = False,
@@ -330,15 +334,24 @@ def console_command(
     Robots send poses ten times a second, and hazards come and go. Times are in ms, from the publication of a pose, or
     the confirmation of a hazard, to one of ten readers among all; processor time and memory are the console-service's,
     the heartbeat (100 ms) is the map-service's, without readers (`idle_`) and with them.
+    With --floors its list has so many other floors; up to 100 of them ask it once a second. Unencrypted. How old (s) is
+    what it knows of them, and how long (ms) its answers take.
     """
     from fognav_experiments.bench import console as events  # noqa: PLC0415  # keeps the other commands fast
 
     kernels.warm_cache(print_line)
     with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
-        figures = asyncio.run(
-            events.measure(Path(folder), readers=readers, robots=robots, seconds=seconds, on_phase=print_line)
-        )
-    asked = {"readers": readers, "robots": robots, "seconds": seconds}
+        if floors:
+            counts = []
+            for count in floors:
+                (at := Path(folder) / str(count)).mkdir()
+                counts.append(asyncio.run(events.measure_floors(at, count, seconds, print_line)))
+            figures, asked = {"counts": counts}, {"seconds": seconds}
+        else:
+            figures = asyncio.run(
+                events.measure(Path(folder), readers=readers, robots=robots, seconds=seconds, on_phase=print_line)
+            )
+            asked = {"readers": readers, "robots": robots, "seconds": seconds}
     _show("console", asked, figures, json=json)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import ssl
 import time
 import tomllib
 from collections import deque
@@ -33,7 +34,6 @@ from fog_runtime.http import ProblemError
 from fog_runtime.http.tokens import PART
 
 if TYPE_CHECKING:
-    import ssl
     from collections.abc import Callable, Collection
     from pathlib import Path
 
@@ -43,9 +43,11 @@ if TYPE_CHECKING:
 
 HERE: Final = "/api/v1/floors/here"
 PERIOD_S: Final = 1.0
-"""How often each floor is asked."""
-OLD_S: Final = 3.0
-"""What is older is not shown as present."""
+"""How often each floor is asked, if there are few."""
+_ASKS_HZ: Final = 200.0
+"""How many are asked in a second at most: an answer takes a millisecond, and a stop waits for none."""
+_OLD_PERIODS: Final = 3.0
+"""What is older than so many periods is not shown as present."""
 AWAY_S: Final = 10.0
 """A robot that was not heard for so long is away: it holds by itself, and its silence does not make a stop fail."""
 ANSWER_LIMIT: Final = 1 << 20
@@ -57,6 +59,8 @@ _STOP: Final = httpx.Timeout(6.0, connect=3.0)
 """A robot has 2 s to answer; a first packet that is lost is sent again after 1 s."""
 _STOPPED_S: Final = 8.0
 """For its whole answer: one that never ends must not hide that others have stopped."""
+_NO_AUTHORITY: Final = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+"""For addresses without encryption: it trusts nobody. Each client would make one of its own, of 0.7 MB."""
 _MANEUVERS: Final = frozenset({"EGRESS", "DOCK", "TELEOP"})
 """Modes in which a robot moves that is not enabled."""
 _LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
@@ -201,6 +205,7 @@ class OwnFloor:
         self._health = health
         self._now = now
         self._begun_at = time.monotonic()
+        self._readiness: tuple[float, asyncio.Task[dict[str, str]]] | None = None
 
     @property
     def id(self) -> str:
@@ -208,8 +213,11 @@ class OwnFloor:
         return self._core.site
 
     async def view(self) -> FloorView:
-        """Return its state, for which its services are asked whether they are ready."""
-        not_ready = await self._forward.readiness()
+        """Return its state; its services are asked whether they are ready once a second, whoever asks for it."""
+        now = self._now()
+        if self._readiness is None or now - self._readiness[0] >= PERIOD_S:
+            self._readiness = now, asyncio.create_task(self._forward.readiness())
+        not_ready = dict(await asyncio.shield(self._readiness[1]))
         if missing := self._health.report()["missing"]:
             not_ready[CONSOLE] = ", ".join(map(str, missing))
         robots, areas = self._core.floor(self._now())
@@ -318,7 +326,7 @@ class _AskError(Exception):
 def _client(peer: Peer, address: str, patience: httpx.Timeout) -> httpx.AsyncClient:
     return httpx.AsyncClient(
         base_url=address, headers={"Authorization": f"Bearer {peer.token}"}, timeout=patience, trust_env=False,
-        verify=True if peer.tls is None else peer.tls,
+        verify=_NO_AUTHORITY if peer.tls is None else peer.tls,
     )  # fmt: skip
 
 
@@ -375,6 +383,7 @@ class Hub:
         self._clock = clock
         self._peers = {peer.id: peer for peer in peers}
         self._known = {peer.id: _Known() for peer in peers}
+        self._period_s = max(PERIOD_S, len(self._peers) / _ASKS_HZ)
 
     @property
     def ids(self) -> list[str]:
@@ -384,15 +393,18 @@ class Hub:
     async def run(self) -> None:
         """Ask all floors, each by itself, until cancelled."""
         async with asyncio.TaskGroup() as tasks:
-            for peer in self._peers.values():
-                tasks.create_task(self._follow(peer), name=f"floor {peer.id}")
+            for place, peer in enumerate(self._peers.values()):
+                # Not all at once: while so many answers are taken apart, a stop would wait.
+                begin_s = self._period_s * place / len(self._peers)
+                tasks.create_task(self._follow(peer, begin_s), name=f"floor {peer.id}")
 
-    async def _follow(self, peer: Peer) -> None:
+    async def _follow(self, peer: Peer, begin_s: float) -> None:
+        await self._clock.sleep(begin_s)
         async with AsyncExitStack() as contexts:
             clients = deque(
                 [await contexts.enter_async_context(_client(peer, address, _ASK)) for address in peer.addresses]
             )
-            async for now in ticker(self._clock, PERIOD_S):
+            async for now in ticker(self._clock, self._period_s):
                 await self._look(peer, clients[0], now)
                 if self._known[peer.id].trouble == "silent":
                     clients.rotate()
@@ -419,7 +431,7 @@ class Hub:
         found = []
         for floor, known in self._known.items():
             age = None if known.floor is None else round(max(0.0, now - known.asked_at), 1)
-            late = not known.trouble and age is not None and age > OLD_S
+            late = not known.trouble and age is not None and age > _OLD_PERIODS * self._period_s
             found.append(
                 FloorEntry(
                     id=floor,

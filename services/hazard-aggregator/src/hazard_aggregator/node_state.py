@@ -211,7 +211,7 @@ class NodeState:
             self.unexplained.clear()
             self.blocked_at.clear()
             self.taken_back = 0
-        elif confirmed == "blocked":
+        else:
             # It sees more than the robot that has stood before it: what it hears of that robot now may show that this
             # is gone. Without that the area, impassable by now, would stay so for as long as the robot is shut in.
             self.explained_since = taken_at

@@ -185,6 +185,8 @@ def _schedule(schedule: Mapping[str, Any]) -> str:
         parts.append(f"due, but {schedule['waits']}")
     elif schedule["next"] is not None:
         parts.append(f"next {local_time(schedule['next'])}")
+    else:
+        parts.append("none is due within a week, or nothing keeps the time of day synchronized: install chrony")
     if (last := schedule["last"]) is not None:
         why = f" ({last['reason']})" if last["reason"] else ""
         parts.append(f"the one of {local_time(last['begin'])} was {last['outcome']}{why}")

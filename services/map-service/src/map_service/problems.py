@@ -16,7 +16,9 @@ class MapProblem(ProblemCode):
     """Problems of the map-service."""
 
     NO_ZONE = "no_zone", 404, "No zone has this id", "Choose one of GET /api/v1/zones, or POST a new one"
-    ZONE_EXISTS = "zone_exists", 409, "A zone with this id exists already", "Choose another id, or change that zone"
+    ZONE_EXISTS = (
+        "zone_exists", 409, "A zone with this id exists already", "Choose another id, or PUT it (zone add --replace)"
+    )  # fmt: skip
     ZONE_CHANGED = (
         "zone_changed", 412, "The zone is not as the request expects: somebody else changed or added it",
         "Read the zone again, then decide anew",
@@ -136,7 +138,7 @@ def _conflict(error: ConflictError) -> ProblemError:
         "site_maps": ("change", MapProblem.MAP_CHANGED, MapProblem.MAP_CHANGED),
     }[error.table]
     if error.outcome == "exists" and missing is MapProblem.NO_ZONE:
-        detail = f"zone {error.id} exists already: choose another id, or PUT it"
+        detail = f"zone {error.id} exists already"
         return ProblemError(MapProblem.ZONE_EXISTS, detail)
     if error.outcome == "missing":
         return ProblemError(missing, f"there is no {what} {error.id} any more: add it again")

@@ -561,7 +561,9 @@ def test_mission_by_the_clock_says_what_is_asked_for_and_what_became_of_the_last
         "weekly": {"time_zone": "Europe/Lisbon", "times": times},
         "enabled": True,
     }
-    assert told.startswith("post: r1 to desk, (1.00, 2.00), mon,tue 08:00-09:00 Europe/Lisbon; none is due within a week")
+    assert told.startswith(
+        "post: r1 to desk, (1.00, 2.00), mon,tue 08:00-09:00 Europe/Lisbon; none is due within a week"
+    )
     assert "install chrony; the one of " in told, "a clock that nothing keeps right begins nothing"
     assert told.endswith("was missed (robot r1 has another mission)")
     demo.answers["GET", "/api/v1/schedules/post"] = made

@@ -1,5 +1,6 @@
 """`fognav node`: a site, a board and a broker take what it writes, and what can't work is refused with the reason."""
 
+import asyncio
 import ctypes
 import json
 import os
@@ -607,3 +608,15 @@ async def test_node_that_does_not_answer_and_broker_that_is_not_there_are_said(t
         await on_broker.learn(server.url, "estig", "n1", "calibrate")
     with pytest.raises(FailedError, match="can't be used"):
         await on_broker.learn(server.url, "estig", "n1", "calibrate")
+
+
+def test_who_watches_a_node_that_says_nothing_is_told_what_to_look_at(monkeypatch):
+    async def nothing(*_):
+        await asyncio.sleep(0.1)
+        for reading in ():
+            yield reading
+
+    monkeypatch.setattr(on_broker, "readings", nothing)
+    monkeypatch.setattr(node_command, "_SILENT_S", 0.0)
+    done = CliRunner().invoke(node_app, ["watch", "n99", "--site-id", "estig", "--broker", "mqtt://127.0.0.1:1"])
+    assert "nothing was heard from n99 yet: is that its id (fognav node list)" in done.output

@@ -38,8 +38,7 @@ from fognav.programs import AGGREGATOR, BROKER
 node_app = typer.Typer(help="Add, watch, calibrate and simulate sensor nodes.", no_args_is_help=True)
 
 T = TypeVar("T")
-_SILENT_S = 5.0
-"""After this long without a word from a node, somebody who watches it is told what to look at."""
+_SILENT_S = 5.0  # until somebody who watches a node that says nothing is told what to look at
 
 NameArgument = Annotated[str, typer.Argument(metavar="NODE", help="The node's id: a to z, 0 to 9 and -.")]
 BrokerOption = Annotated[
@@ -331,8 +330,7 @@ def _keep(url: str, site: str, name: str, own: Credentials) -> None:
 
 
 async def _watch(on: tuple[str, str, Credentials], name: str, count: int | None, *, json: bool) -> None:
-    seen = 0
-    url, site, own = on
+    seen, (url, site, own) = 0, on
     nothing = f"nothing was heard from {name} yet: is that its id (fognav node list), and has it power and Wi-Fi?"
     hint = asyncio.get_running_loop().call_later(_SILENT_S, print_line, nothing)
     async for reading in on_broker.readings(url, site, name, own):

@@ -186,6 +186,16 @@ def test_robot_leaves_its_dock_and_is_enabled_afterwards_only_if_it_was_before(e
     assert gate.run(request="undock").refusal.code == "not_on_dock"
 
 
+def test_mission_takes_a_robot_off_its_dock_only_after_it_has_been_there_for_a_second():
+    gate = Gate()
+    assert gate.run(docked_for=0.0, **MISSION).mode == "HOLD", "one frame may be wrong"
+    assert gate.run(docked_for=0.9, **MISSION).mode == "HOLD"
+    assert gate.run(docked_for=1.0, **MISSION).mode == "DOCK"
+    gate = Gate()
+    gate.run(docked_for=0.0, **MISSION)
+    assert gate.run(2.2, **MISSION).mode == "NORMAL"
+
+
 @pytest.mark.parametrize(("changes", "words"), STOPS)
 def test_condition_that_stops_a_robot_refuses_an_undocking_and_ends_one_as_it_stops_any_drive(changes, words):
     assert words in Gate(**ON_DOCK).run(request="undock", **changes).refusal

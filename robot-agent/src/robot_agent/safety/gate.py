@@ -179,6 +179,8 @@ def _may_undock(
     """Return whether an enabled robot leaves its dock for its mission: it would drive, were it not on its dock."""
     if inputs.docked_for is None or inputs.resting is not None or not inputs.mission or state.latched:
         return False
+    if inputs.docked_for < config.dock_settled:  # a single wrong frame must not make it back away
+        return False
     if _is_recent(Level.PROTECTIVE_STOP, state.last_demanded[Level.PROTECTIVE_STOP], now, config):
         return False
     stops = [finding for finding in findings if finding.level >= Level.HOLD and not finding.rest]

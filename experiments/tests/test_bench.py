@@ -177,6 +177,15 @@ async def test_readers_of_events_all_get_poses_and_hazards(tmp_path: Path) -> No
     assert figures["heartbeat_gap_p50_ms"] > 0
 
 
+@pytest.mark.live
+@pytest.mark.long
+async def test_list_of_floors_is_asked_and_its_floors_are_answered(tmp_path: Path) -> None:
+    figures = await console_events.measure_floors(tmp_path, 30, 3.0, print)
+    assert 0.0 < figures["age_p50_s"] <= figures["age_p99_s"] < 3.0
+    assert figures["answers"] > 30
+    assert figures["cpu_percent"] > 0.0
+
+
 def test_localization_figures_are_there_and_the_search_and_match_ran() -> None:
     figures = cores.measure_localization(common.make_office(60.0, 40.0), 300, 60, 2, 1)
     assert figures["cells"] == 800 * 1200

@@ -16,6 +16,7 @@ from fognav_experiments.comparison.drives import ExperimentSpec, RouteSpec
 from fognav_experiments.comparison.people import PeopleDrive, people_drive, people_tasks
 from fognav_experiments.comparison.people_page import publish
 from fognav_experiments.comparison.records import DriveFiles
+from planner.waits.blocks import Blocks
 
 pytestmark = pytest.mark.timeout(900)
 SEEDS = int(os.environ.get("FOGNAV_CROWD_SEEDS", "2"))
@@ -155,13 +156,17 @@ def test_robot_that_somebody_passes_in_a_watched_area_goes_on_by_itself():
 
 
 @pytest.mark.drive
-def test_a_drive_among_people_tells_what_nodes_reported_of_them_and_what_they_cost(tmp_path):
+def test_a_drive_among_people_tells_what_nodes_reported_of_them_and_what_they_cost(tmp_path, monkeypatch):
+    known, restore = [], Blocks.restore
+    monkeypatch.setattr(Blocks, "restore", lambda blocks, seen, now: (known.append(seen), restore(blocks, seen, now)))
     spec = ExperimentSpec(routes=[RouteSpec(start="west", goal="east", areas=["z1"])])
     drives = [people_drive(ring.ring_site(), "", task) for task in people_tasks(spec, 1, 1, [4])]
     assert all(drive.success and not drive.contacts for drive in drives), drives
     among, learned, alone = drives
     assert min(drive.closest_m for drive in drives) > 0.0
-    assert learned.paths <= among.paths, "a planner that knows that they go on waits"
+    assert [list(seen) for seen in known] == [[], [], ["z1"], []], "one planner has seen a drive before"
+    assert known[2]["z1"].hours
+    assert learned.learned
     found = among.episodes
     assert found.blocks
     assert found.passed >= found.passed_reported > 0

@@ -41,7 +41,7 @@ _AT_ONCE: Final = 20
 """Readers that connect at the same time."""
 _READY_S: Final = 120.0
 _CONNECTED_S: Final = 300.0
-MOST_ASKERS: Final = 100
+_MOST_ASKERS: Final = 100
 """How many of the floors at most ask the one that lists them: those of a campus have each other, not all have all."""
 _CONNECTIONS: Final = 20
 """Over which they ask: one address gets no more than some."""
@@ -212,16 +212,8 @@ async def measure_floors(folder: Path, count: int, seconds: float, on_phase: Cal
     """Return what a list of so many other floors costs a console-service; `folder` is empty. Raises `FailedError`."""
     write_nodes(folder, NODES)
     pipe = asyncio.subprocess.PIPE
-    playing = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-m",
-        "fognav_experiments.bench.console",
-        "floors",
-        str(count),
-        stdin=pipe,
-        stdout=pipe,
-        limit=1 << 20,
-    )
+    words = ["-m", "fognav_experiments.bench.console", "floors", str(count)]
+    playing = await asyncio.create_subprocess_exec(sys.executable, *words, stdin=pipe, stdout=pipe, limit=1 << 20)
     assert playing.stdin is not None
     assert playing.stdout is not None
     try:
@@ -280,7 +272,7 @@ async def _play_floors(count: int) -> None:
     sys.stdout.write(" ".join(str(server.sockets[0].getsockname()[1]) for server in servers) + "\n")
     sys.stdout.flush()
     port, token = (await asyncio.to_thread(sys.stdin.readline)).split()
-    askers = min(count, MOST_ASKERS)
+    askers = min(count, _MOST_ASKERS)
     connections = min(askers, _CONNECTIONS)
     async with asyncio.TaskGroup() as tasks:
         asking = [

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from fognav_experiments.lockstep import LockstepDrive
     from planner.waits.blocks import BlockRecord
 
-_LATER_SEED: Final = 1_000_003
-"""What a drive's seed is raised by for the drive before it, which has other people."""
+_SEED_OF_EARLIER: Final = 1_000_003
+"""What is added to the seed of a drive for the one before it, which has other people."""
 KINDS: Final[tuple[tuple[Setup, bool], ...]] = (("fog", False), ("fog", True), ("lean", False))
 """A robot that the fog leads, the same whose planner has learned for how long blocks last, and the control: one on its
 own at the same rates."""
@@ -249,7 +249,7 @@ def people_drive(site: LoadedSite, commit: str, task: PeopleTask) -> PeopleDrive
     """Drive one task in lockstep; the same whenever it is repeated."""
     learned: dict[str, BlockRecord] = {}
     if task.learned:
-        earlier = msgspec.structs.replace(task.drawn, seed=task.drawn.seed + _LATER_SEED)
+        earlier = msgspec.structs.replace(task.drawn, seed=task.drawn.seed + _SEED_OF_EARLIER)
         _, run = _driven(site, task._replace(drawn=earlier), commit, {})
         records = run.system.fog.planner.core.waits.blocks.to_store(run.now)
         learned = {area: msgspec.structs.replace(record, standing=None) for area, record in records.items()}

@@ -236,12 +236,17 @@ def test_command_without_a_system_fails_with_the_remedy() -> None:
     assert "no demo or fog node runs on this machine. Start one (fognav demo" in run("zone", "list", code=1)
 
 
-def test_command_with_several_systems_asks_for_one(demo: Service) -> None:
+def test_command_with_several_systems_asks_for_one(demo: Service, tmp_path: Path) -> None:
+    (tmp_path / "tokens.toml").touch()
     demo.answers["GET", "/api/v1/zones"] = (200, {"zones": [], "active": [], "epoch": 1, "seq": 1})
     with Registration(lambda: system("demo-2", demo.url)) as registration:
         registration.update()
         assert "choose one with --fog (demo-1, demo-2)" in run("zone", "list", code=2)
         assert run("zone", "list", "--fog", "demo-2") == "no zones"
+        assert "choose one with --fog" in run("token", "create", "anna", code=2)
+        run("token", "create", "anna", "--fog", "demo-1")
+        assert "anna: viewer" in run("token", "list", "--fog", "demo-1")
+        run("token", "revoke", "anna", "--fog", "demo-1")
 
 
 def test_status_shows_addresses_token_and_processes(demo: Service, tmp_path: Path) -> None:

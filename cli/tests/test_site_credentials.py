@@ -133,6 +133,27 @@ def test_added_robot_gets_one_file_and_a_removed_one_is_unknown(security: SiteSe
         assert reason in done.output.replace("\n", " ")
 
 
+def test_robot_and_node_of_a_further_floor_leave_those_of_the_same_id_on_the_first_one_alone(
+    security: SiteSecurity, tmp_path: Path
+) -> None:
+    upstairs = Path(shutil.copytree(ROOT / "sites" / "estig", tmp_path / "upstairs")) / "site.toml"
+    upstairs.write_text(upstairs.read_text().replace('id = "estig"', 'id = "upstairs"', 1))
+    board = ("--wifi", "Lab", "--wifi-password", "", "--fog-host", "192.168.7.1", "--out", str(tmp_path / "board"))
+    replace = ("node", "replace", "n1", "--site", str(upstairs.parent), *board)
+    assert "not of upstairs" in invoke(*replace).output
+    security.add_floor("upstairs", robots=["r1"], nodes=["n1"])
+    lists = [security.folder("mosquitto") / "users", security.folder("zenoh") / "users"]
+    before = [set(file.read_text().splitlines()) for file in lists]
+    run(*replace, "--json")
+    assert json.loads((tmp_path / "board" / "node.json").read_text())["user"] == "upstairs.n1"
+    assert "of which floor?" in invoke("robot", "add", "r1").output
+    assert Credentials.read(Path(run("robot", "add", "r1", "--floor", "upstairs", "--json")["credentials"])).user == (
+        "upstairs.r1"
+    )
+    changed = [set(file.read_text().splitlines()) - known for file, known in zip(lists, before, strict=True)]
+    assert [[line.partition(":")[0] for line in each] for each in changed] == [["upstairs.n1"], ["upstairs.r1"]]
+
+
 def test_added_node_s_board_gets_the_password_and_the_authority(security: SiteSecurity, tmp_path: Path) -> None:
     floor = Path(shutil.copytree(ROOT / "sites" / "estig", tmp_path / "floor"))
     network = ("--wifi", "Lab", "--wifi-password", "secret12", "--fog-host", "192.168.7.1")

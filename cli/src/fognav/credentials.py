@@ -30,6 +30,10 @@ CredentialsOption = Annotated[
         help=f"Folder of the site's certificates and users; default: {VARIABLE}.",
     ),
 ]
+FloorOption = Annotated[
+    str | None,
+    typer.Option("--floor", metavar="SITE", help="Id of its site; needed where the fog node serves several."),
+]
 
 
 def credentials_folder(given: Path | None) -> Path | None:
@@ -58,6 +62,17 @@ def changeable_security(given: Path | None) -> SiteSecurity:
     """Open them to change them; raises as `open_security` and `require_changeable`."""
     require_changeable(named_folder(given))
     return open_security(given)
+
+
+def user_on(security: SiteSecurity, floor: str | None, name: str) -> str:
+    """Return how the servers call a robot or node.
+
+    Raises `WrongUseError` where there are several floors and none is named, and `SecurityError` for an unknown one.
+    """
+    first, *further = security.sites
+    if floor is None and further:
+        raise WrongUseError(f"{name} of which floor? Name it with --floor: {', '.join((first, *further))}")
+    return security.user_on(floor or first, name)
 
 
 def require_changeable(folder: Path) -> None:

@@ -19,6 +19,7 @@ from fognav import checkout
 from fognav.aside import require_no_upgrade
 from fognav.credentials import (
     CredentialsOption,
+    FloorOption,
     changeable_security,
     credentials_folder,
     named_folder,
@@ -26,9 +27,10 @@ from fognav.credentials import (
     own_hosts,
     require_changeable,
     security_errors,
+    user_on,
 )
 from fognav.operate.fog import find_fog
-from fognav.operate.options import JsonOption, checked_id
+from fognav.operate.options import FogOption, JsonOption, checked_id
 from fognav.output import (
     NOT_TRUE,
     FailedError,
@@ -55,7 +57,7 @@ NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Who uses it; 
 
 
 @token_app.command("create", epilog="Example: fognav token create anna --role operator --file /run/fognav/tokens.toml")
-def token_create(
+def token_create(  # noqa: PLR0913  # each option is an argument
     name: NameArgument,
     *,
     role: Annotated[
@@ -63,6 +65,7 @@ def token_create(
         typer.Option("--role", help="guest may log in, viewer reads, operator writes, admin also recovers."),
     ] = "viewer",
     file: FileOption = None,
+    fog: FogOption = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE", help="Write it there, as credentials (FOGNAV_CREDENTIALS_FILE)."),
@@ -78,7 +81,7 @@ def token_create(
         if out is not None and out.exists():
             raise WrongUseError(f"{out} already exists: name another file with --out, or remove it")
         authority = open_security(security).authority.trusted if credentials_folder(security) is not None else ""
-        token = create_token(_changeable_tokens(file), name, role)
+        token = create_token(_changeable_tokens(file, fog), name, role)
         if out is not None:
             text = to_toml(name, authority=authority, passwords={}, token=token)
             atomic_write(out, text.encode())
@@ -89,31 +92,33 @@ def token_create(
 
 
 @token_app.command("list", epilog="Example: fognav token list --json")
-def token_list(*, file: FileOption = None, json: JsonOption = False) -> None:
+def token_list(*, file: FileOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
     """List who has a token, in which role."""
     with exit_codes():
-        entries = read_tokens(_tokens_file(file))
+        entries = read_tokens(_tokens_file(file, fog))
         tokens = [{"name": entry.name, "role": entry.role, "created": entry.created} for entry in entries]
         lines = [f"{each.name}: {each.role}" + (f", since {each.created}" if each.created else "") for each in entries]
         print_result({"tokens": tokens}, *lines, json=json)
 
 
 @token_app.command("revoke", epilog="Example: fognav token revoke anna")
-def token_revoke(name: NameArgument, *, file: FileOption = None, json: JsonOption = False) -> None:
+def token_revoke(
+    name: NameArgument, *, file: FileOption = None, fog: FogOption = None, json: JsonOption = False
+) -> None:
     """Revoke a token: the services refuse it from their next request on."""
     with exit_codes():
-        revoke_token(_changeable_tokens(file), name)
+        revoke_token(_changeable_tokens(file, fog), name)
         print_result({"name": name, "revoked": True}, f"the token of {name} is revoked", json=json)
 
 
-def _tokens_file(given: Path | None) -> Path:
-    """Return the tokens file; raises `WrongUseError` when there is none to find."""
+def _tokens_file(given: Path | None, fog: str | None) -> Path:
+    """Return the tokens file; raises `WrongUseError` when there is none to find, or a choice."""
     if given is not None:
         return given
-    if named := os.environ.get(_VARIABLE):
+    if fog is None and (named := os.environ.get(_VARIABLE)):
         return Path(named)
     try:
-        token_file = find_fog(None).system.token_file
+        token_file = find_fog(fog).system.token_file
     except FailedError:
         token_file = None
     if token_file is None:
@@ -121,9 +126,9 @@ def _tokens_file(given: Path | None) -> Path:
     return Path(token_file).with_name(_TOKENS)
 
 
-def _changeable_tokens(given: Path | None) -> Path:
+def _changeable_tokens(given: Path | None, fog: str | None) -> Path:
     """Return the tokens file; raises as `_tokens_file`, and `FailedError` while its fog node is upgraded."""
-    file = _tokens_file(given)
+    file = _tokens_file(given, fog)
     require_no_upgrade(file)
     return file
 
@@ -232,6 +237,7 @@ def _show(security: SiteSecurity, *, json: bool) -> None:
 def robot_add(
     robot: Annotated[str, typer.Argument(metavar="ROBOT", help="The robot's id: a to z, 0 to 9 and -.")],
     *,
+    floor: FloorOption = None,
     security: CredentialsOption = None,
     remove: Annotated[bool, typer.Option("--remove", help="Let it in no longer.")] = False,
     json: JsonOption = False,
@@ -243,11 +249,12 @@ def robot_add(
     """
     with exit_codes(), security_errors():
         opened = changeable_security(security)
-        file = None if remove else opened.add_robot(checked_id(robot))
-        if remove and not opened.remove(robot):
-            raise WrongUseError(f"there is no robot {robot}. Known are: {', '.join(sorted(opened.users()))}")
+        user = user_on(opened, floor, checked_id(robot))
+        file = None if remove else opened.add_robot(user)
+        if remove and not opened.remove(user):
+            raise WrongUseError(f"there is no robot {user}. Known are: {', '.join(sorted(opened.users()))}")
         line = (
-            f"the router refuses {robot} once it was restarted"
+            f"the router refuses {user} once it was restarted"
             if file is None
             else f"wrote {file}: copy it to the robot, for its owner only, and delete it here"
         )

@@ -6,7 +6,7 @@ import msgspec
 import typer
 
 from fog_contracts.messages import AreaDefinition, Limits, Source
-from fognav.credentials import CredentialsOption, changeable_security, security_errors
+from fognav.credentials import CredentialsOption, FloorOption, changeable_security, security_errors, user_on
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption, checked_id
 from fognav.output import FailedError, WrongUseError, exit_codes, print_list, print_result
@@ -118,6 +118,7 @@ def source_user(
     topic: Annotated[
         list[str] | None, typer.Option("--topic", metavar="T", help="What it may publish and read; repeatable.")
     ] = None,
+    floor: FloorOption = None,
     security: CredentialsOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -127,9 +128,10 @@ def source_user(
     """
     with exit_codes(), security_errors():
         made = changeable_security(security)
-        file = made.add_device(checked_id(name), topic) if topic else made.add_node(checked_id(name))
+        user = checked_id(name) if topic else user_on(made, floor, checked_id(name))
+        file = made.add_device(user, topic) if topic else made.add_node(user)
         print_result(
-            {"user": name, "topics": topic or [], "credentials": str(file)},
+            {"user": user, "topics": topic or [], "credentials": str(file)},
             f"wrote {file}: its user, password and certificate are what {name} needs; then delete it here",
             "the broker knows it once it has read its lists again (SIGHUP)",
             json=json,

@@ -141,15 +141,15 @@ def provision(file: Path, members: dict[str, Any], passwords: Path | None) -> No
         raise
 
 
-def let_in(security: SiteSecurity, node: str) -> tuple[str, str]:
-    """Let a node in by a site's credentials; return its new password, and what its board shall trust (PEM).
+def let_in(security: SiteSecurity, site: str, node: str) -> Credentials:
+    """Let a node of a site in; return its user, with a new password, and what its board shall trust (PEM).
 
     Raises `SecurityError` or `AuthorityError`.
     """
-    file = security.add_node(node)
+    file = security.add_node(security.user_on(site, node))
     credentials = Credentials.read(file)
     file.unlink()  # the board has it: nobody else needs it
-    return credentials.passwords["mqtt"], credentials.authority
+    return credentials
 
 
 def write_authority(file: Path, authority: str) -> None:
@@ -346,8 +346,9 @@ class BoardOptions:
         members = settings(loaded.site.id, node, access, new_password(), self.profile)
         if (folder := credentials_folder(self.security)) is not None:
             with security_errors():
-                members["password"], authority = let_in(changeable_security(folder), node.id)
-            write_authority(self._authority, authority)
+                own = let_in(changeable_security(folder), loaded.site.id, node.id)
+            members |= {"user": own.user, "password": own.passwords["mqtt"]}
+            write_authority(self._authority, own.authority)
         if self.firmware == "esphome":
             members = esphome_secrets(members, self._authority)
             shutil.copyfile(checkout.root() / _ESPHOME, self.out / _ESPHOME.name)

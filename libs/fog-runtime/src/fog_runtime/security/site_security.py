@@ -155,6 +155,15 @@ class SiteSecurity:
         """The site for which they were made, then its further floors, in the order in which they were added."""
         return [self._plan.site, *self._plan.floors]
 
+    def user_on(self, site: str, name: str) -> str:
+        """Return how the servers call a robot or node of one of `sites`; raises `SecurityError` for another site."""
+        if site not in self.sites:
+            raise SecurityError(
+                f"{self._folder} has the credentials of {', '.join(self.sites)}, not of {site}: name another folder, "
+                "or let its fog node serve that site first (fognav up --site)"
+            )
+        return name if site == self._plan.site else users.on_floor(site, name)
+
     def users(self) -> set[str]:
         """Return everybody whom a server admits."""
         return {user for program in _PROGRAM_OF.values() for user in self._files.members(program)}

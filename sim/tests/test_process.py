@@ -37,6 +37,13 @@ x = 4.0
 y = 0.25
 theta = 1.5707963
 sonars = [{ angle = -0.1, range_limit = 2.2 }, { angle = 0.1, range_limit = 2.2 }]
+[[nodes]]
+id = "n2"
+area = "z1"
+x = 4.0
+y = 2.75
+theta = -1.5707963
+sonars = [{ angle = -0.1, range_limit = 2.2 }, { angle = 0.1, range_limit = 2.2 }]
 [[robots]]
 id = "r1"
 start = { x = 1.0, y = 1.5, theta = 0.0 }
@@ -164,6 +171,11 @@ async def test_placed_obstacle_shows_in_the_readings_and_in_the_ground_truth(tmp
         await until(lambda: abs(rig.truths[-1].x - 6.0) < 0.01, "the robot was moved")
         reply = await rig.send_command(remove=["nothing"])
         assert not reply.accepted
+
+
+async def test_node_whose_board_alone_has_its_password_is_left_to_that(tmp_path):
+    async with simulator(tmp_path) as (rig, _):
+        assert '"event": "nodes_left_to_their_boards", "nodes": ["n2"]' in (rig.folder / "sim.log").read_text("utf-8")
 
 
 async def test_silenced_node_publishes_nothing_and_a_killed_one_leaves_its_last_will(tmp_path):

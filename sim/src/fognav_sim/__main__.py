@@ -46,10 +46,12 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     node_credentials_dir: Path | None = None
     """Folder with the credentials of each sensor node, `NODE.toml`; without it the nodes are nobody."""
 
-    def credentials_of(self, node: str) -> Credentials:
-        """Read the credentials of a sensor node; raises `CredentialsError`."""
-        folder = self.node_credentials_dir
-        return NOBODY if folder is None else Credentials.read(folder / f"{node}.toml")
+    def credentials_of(self, node: str) -> Credentials | None:
+        """Read the credentials of a sensor node, None if its board alone has them; raises `CredentialsError`."""
+        if self.node_credentials_dir is None:
+            return NOBODY
+        file = self.node_credentials_dir / f"{node}.toml"
+        return Credentials.read(file) if file.exists() else None
 
 
 _log = logs.get("sim")
@@ -95,12 +97,14 @@ async def main() -> None:
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(live_world.run(), name="world")
                     tasks.create_task(live_world.publish_truth(edge, robot.id), name="truth")
-                    sonars = make_nodes(loaded.site.nodes, boot, clock.now(), settings.nodes)
+                    found = ((node.id, settings.credentials_of(node.id)) for node in loaded.site.nodes)
+                    own = {node: credentials for node, credentials in found if credentials is not None}
+                    simulated = [node for node in loaded.site.nodes if node.id in own]
+                    if real := [node.id for node in loaded.site.nodes if node.id not in own]:
+                        _log.warning("nodes_left_to_their_boards", nodes=real)
                     nodes = [
-                        VirtualNode(
-                            each, live_world, settings.mqtt_url, clock, site, settings.credentials_of(each.node.id)
-                        )
-                        for each in sonars
+                        VirtualNode(each, live_world, settings.mqtt_url, clock, site, own[each.node.id])
+                        for each in make_nodes(simulated, boot, clock.now(), settings.nodes)
                     ]
                     tasks.create_task(run_nodes(nodes, clock), name="nodes")
                     while True:

@@ -22,6 +22,7 @@ from fog_runtime.backup import STAMP, BackupError
 from fog_runtime.credentials import Credentials
 from fog_runtime.security.site_security import CERTIFICATE, SiteSecurity
 from fog_runtime.stores.redis_connection import RedisConnection
+from fog_runtime.token_file import create_token, read_tokens, revoke_token
 from fog_supervisor.supervisor import NotReadyError, Program, Supervisor
 from fognav.__main__ import app
 from fognav.credentials import security_errors
@@ -329,20 +330,25 @@ async def test_backup_of_each_floor_is_restored_on_an_empty_machine(tmp_path, up
         await backups.restore(tmp_path / "estig.tar.gz", empty, tmp_path / "restored" / "estig", replace=False)
 
 
-async def test_older_backup_of_one_floor_shuts_nobody_out_who_was_added_since(tmp_path, upstairs):
+async def test_older_backup_of_one_floor_neither_shuts_out_who_was_added_since_nor_admits_who_was_removed(
+    tmp_path, upstairs
+):
     estig = shutil.copytree(ESTIG, tmp_path / "site")
     folder, hosts = NodeFolder(tmp_path / "data"), ["localhost", "127.0.0.1"]
     hosted_sites([estig], folder.security, hosts)
-    folder.keys("estig")
+    tokens = folder.keys("estig") / "tokens.toml"
+    create_token(tokens, "left", "operator")
     SiteSecurity.open(folder.security).add_robot("sold")
     folders.remember(folder.path, folders.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
     await backups.create(tmp_path / "older.tar.gz", folder, estig)
     hosted_sites([estig, upstairs], folder.security, hosts)
     SiteSecurity.open(folder.security).add_robot("r7")
     SiteSecurity.open(folder.security).remove("sold")
+    revoke_token(tokens, "left")
     before = SiteSecurity.open(folder.security).users()
     made, refused, _ = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
-    assert (sorted(made.folders), refused) == (["recordings", "secrets", "site"], ["sold"])
+    assert (sorted(made.folders), refused) == (["recordings", "site"], ["sold"])
+    assert [each.name for each in read_tokens(tokens)] == ["admin"]
     assert SiteSecurity.open(folder.security).users() == before
     service = Credentials.read(SiteSecurity.open(folder.security).credentials("upstairs.map-service"))
     async with backups.redis_of(folder, "estig", estig) as place:

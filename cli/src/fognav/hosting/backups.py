@@ -24,6 +24,7 @@ from fog_runtime.backup import Backup, BackupError, File, read_archive
 from fog_runtime.configuration.site import SiteError
 from fog_runtime.credentials import Credentials, CredentialsError
 from fog_runtime.files import PRIVATE, atomic_write
+from fog_runtime.keys import TOKENS
 from fog_runtime.security.site_security import AUTHORITY, SiteSecurity
 from fog_runtime.security.users import ANYBODY, REDIS_ADMINISTRATOR, USERS, on_floor, user_of
 from fog_supervisor import net, servers
@@ -190,8 +191,9 @@ async def create(file: Path, folder: NodeFolder, directory: Path | None) -> Crea
 async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: bool) -> Restored:
     """Restore a backup of one site, whose folder is to be `directory`, while the node is down.
 
-    With `replace`, credentials of the same authority stay: they are those of all sites, and newer. Raises `FailedError`
-    while the node runs, `BackupError`, and as `redis_of`.
+    With `replace`, credentials of the same authority stay, and the site's tokens and keys with them: they are newer,
+    and the backup's would admit again whoever was shut out since. Raises `FailedError` while the node runs,
+    `BackupError`, and as `redis_of`.
     """
     with folder.in_use():
         archive = await asyncio.to_thread(read_archive, file)
@@ -206,6 +208,8 @@ async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: b
         # Another floor's backup has brought one of another moment: it stays, and the next backup writes a new one.
         indexed = not replace and index_folder(folder.path).exists()
         keep = ({SECURITY} if stay else set()) | ({RECORDINGS} if indexed else set())
+        if stay and (folder.path / "keys" / archive.site / TOKENS).exists():
+            keep.add(backup.SECRETS)
         async with redis_of(folder, archive.site, directory) as place:
             made = await backup.restore(file, place, replace=replace, keep=keep)
         return Restored(made, refused, missing_recordings(folder.path, archive.folders.get(RECORDINGS, {})))
@@ -322,7 +326,8 @@ def restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Bac
     backup.require_same_site(read_archive(file), directory)  # before the node's folder is made
     made, refused, gone = asyncio.run(restore(file, NodeFolder(up), directory, replace=replace))
     if SECURITY not in made.folders:
-        print_line(f"the credentials in {up} stay: they have the same authority, and what was added since")
+        kept = "credentials" if backup.SECRETS in made.folders else "credentials, tokens and keys"
+        print_line(f"the {kept} in {up} stay: they have the same authority, and what was changed since")
     if refused:
         print_line(f"they do not admit {', '.join(refused)}, whom the backup has: add them again, if they shall be")
     if gone:

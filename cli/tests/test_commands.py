@@ -95,6 +95,11 @@ def test_commands_are_listed_by_who_uses_them_and_none_has_no_group() -> None:
     assert listed.split()[0] == "demo"
 
 
+def test_what_is_no_number_is_named_with_how_to_write_one() -> None:
+    done = runner.invoke(app, ["map", "convert", "map.yaml", "map.png", "--resolution", "0,1"])
+    assert "'--resolution': '0,1' is no number: write it with a point, such as 0.1" in " ".join(done.output.split())
+
+
 @pytest.mark.parametrize("arguments", [["demo", "--speed", "0"], ["--help"], ["nonsense"]])
 def test_usage_shows_the_documented_name_of_the_command(arguments: list[str]) -> None:
     done = subprocess.run([sys.executable, "-m", "fognav", *arguments], capture_output=True, text=True, check=False)

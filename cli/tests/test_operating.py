@@ -378,14 +378,21 @@ def test_zones_are_listed_shown_and_removed(demo: Service) -> None:
     demo.answers["GET", "/api/v1/zones/z-1"] = (200, ZONE)
     demo.answers["DELETE", "/api/v1/zones/z-1"] = (204, None)
     assert run("zone", "list") == "z-1: BLOCKED circle, wet floor, by anna (has no effect now)"
+    clock = {"parts": {"clock": {"detail": "nothing keeps the time of day synchronized"}}}
+    demo.answers["GET", "/readyz"] = (503, clock)
+    for end, told in (({"ttl_s": 60.0}, False), ({}, True)):  # a time to live needs no time of day
+        ended = {**ZONE, "expires_at": 1.0, **end}
+        demo.answers["GET", "/api/v1/zones"] = (200, {"zones": [ended], "active": ["z-1"], "epoch": 1, "seq": 1})
+        assert ("nothing keeps the time of day synchronized" in run("zone", "list")) is told
     assert run("zone", "show", "z-1") == "z-1: BLOCKED circle, wet floor, by anna"
     assert json.loads(run("zone", "remove", "z-1", "--json"))["removed"] is True
 
 
 def test_refusal_gives_reason_and_remedy_of_the_problem_document(demo: Service) -> None:
-    problem = {"detail": "there is no zone nix", "remedy": "List the zones"}
-    demo.answers["GET", "/api/v1/zones/nix"] = (404, problem)
-    assert "the map-service refused it: there is no zone nix. List the zones" in run("zone", "show", "nix", code=1)
+    remedy = "Choose one of GET /api/v1/zones, or POST a new one"
+    demo.answers["GET", "/api/v1/zones/nix"] = (404, {"detail": "there is no zone nix", "remedy": remedy})
+    said = "there is no zone nix. Choose one of `fognav zone list`, or add one"  # a command, and not a route
+    assert f"the map-service refused it: {said}" in run("zone", "show", "nix", code=1)
     demo.answers["DELETE", "/api/v1/zones/z-1"] = (401, {"detail": "the token is unknown"})
     assert "the token is unknown. Set FOGNAV_TOKEN to an operator's token" in run("zone", "remove", "z-1", code=1)
 
@@ -628,6 +635,20 @@ def test_stop_needs_neither_key_nor_token_and_takes_the_way_that_works(service: 
         answer = {"accepted": True, "reason": "disabled", "mode": "NORMAL"}
         service.answers["POST", "/api/v1/robots/r1/stop"] = (200, answer)
         assert run("robot", command).startswith("accepted: disabled")
+
+
+def test_stop_without_a_valid_token_names_no_robot_says_how_and_stops_the_floor(demo: Service) -> None:
+    unknown = (401, {"detail": "the token is unknown"})
+    demo.answers["GET", "/api/v1/robots"] = demo.answers["POST", "/api/v1/floors/stop"] = unknown
+    urls = {"planner": demo.url, "console-service": demo.url, "zenoh-router": "tcp/127.0.0.1:1"}
+    with Registration(lambda: system("demo-2", demo.url, robots=[], urls=urls)) as registration:
+        registration.update()
+        assert "name the robot with --robot: then no token is needed" in run("robot", "stop", "--fog", "demo-2", code=2)
+        stopped = {"id": "here", "acknowledged": True, "robots": [{"id": "r1", "stopped": True}], "detail": ""}
+        demo.answers["POST", "/api/v1/floors/here/stop"] = (200, stopped)
+        done = CliRunner().invoke(app, ["floor", "stop", "--fog", "demo-2"])
+        assert (done.exit_code, done.stdout) == (1, "here: stopped: r1\n")
+        assert "no other floor was told" in done.stderr
 
 
 STOP = "/api/v1/robots/r1/stop"

@@ -1,14 +1,15 @@
 """`fognav floor`: list the floors of a building on several machines, and stop them (docs/campus.md)."""
 
+import http.client
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
 from fog_runtime.credentials import CredentialsError
-from fognav.operate.fog import find_fog
+from fognav.operate.fog import RefusedError, find_fog
 from fognav.operate.options import FogOption, JsonOption, checked_id
-from fognav.output import NOT_TRUE, WrongUseError, exit_codes, local_time, print_answer, print_json
+from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, local_time, print_answer, print_json
 from fognav.programs import CONSOLE
 
 floor_app = typer.Typer(help="List floors on several machines, and stop them.", no_args_is_help=True)
@@ -68,15 +69,26 @@ def floor_stop(
     """Stop all robots of floors, of all without a FLOOR; an operator of each floor must enable them again.
 
     All floors are told at once, each once. The exit code is 1 if one has not acknowledged it: its line says what to do.
+    Without a valid token it stops the floor of this fog node alone, and the exit code is 1.
     """
     with exit_codes():
+        found = find_fog(fog)
         body = {"floors": [checked_id(floor) for floor in floors] if floors else None}
-        stops = find_fog(fog).send("POST", CONSOLE, f"{_FLOORS}/stop", body, timeout_s=_STOP_S)
+        refused: RefusedError | None = None
+        try:
+            stops = found.send("POST", CONSOLE, f"{_FLOORS}/stop", body, timeout_s=_STOP_S)
+        except RefusedError as error:
+            if floors or error.status not in (http.client.UNAUTHORIZED, http.client.FORBIDDEN):
+                raise
+            refused = error
+            stops = [found.send("POST", CONSOLE, f"{_FLOORS}/here/stop", timeout_s=_STOP_S)]
         if json:
             print_json({"floors": stops})
         else:
             for stop in stops:
                 print_answer(f"{stop['id']}: {_outcome(stop)}")
+        if refused is not None:
+            raise FailedError(f"no other floor was told: {refused}")
         if not all(stop["acknowledged"] for stop in stops):
             raise typer.Exit(NOT_TRUE)
 

@@ -40,6 +40,13 @@ GROUPS: Final = (TRY_IT, OPERATE, SET_UP, RUN, MEASURE, DEVELOP, OTHERS)
 """Groups of commands, in the order in which a newcomer needs them; the last has those that name none."""
 
 
+_NUMBERS: Final = {
+    "float_parsing": "no number: write it with a point, such as 0.1",
+    "int_parsing": "no whole number: write one, such as 10",
+}
+"""What is said of an option or argument that is no number, by the parser's name for that."""
+
+
 class Row(NamedTuple):
     """A command of this package: its group ("": none), and its name ("up", or "zone import" for one of `zone`).
 
@@ -84,6 +91,16 @@ class Commands(TyperGroup):
 
     rows: ClassVar[tuple[Row, ...]] = ()
     _loaded = False
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401  # typer's class is private
+        """Run the command; what is no number is named as such, in other words than those of the parser."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            for found in getattr(error.__cause__, "errors", list)():
+                if (wanted := _NUMBERS.get(found["type"])) is not None:
+                    error.message = f"{found['input']!r} is {wanted}"
+            raise
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401  # typer's class is private
         """Return the names of all commands."""

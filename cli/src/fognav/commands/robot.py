@@ -331,9 +331,9 @@ def _service(found: Fog, robot: str | None, method: str, body: object, became: s
 def _end_mission(fog: Fog, robot: str | None) -> str:
     try:
         fog.send("DELETE", PLANNER, f"/api/v1/robots/{fog.robot(robot)}/goal")
-    except RefusedError as error:
-        return "it had no mission" if error.code == "no_mission" else str(error)
     except FailedError as error:
+        if isinstance(error, RefusedError) and error.code == "no_mission":
+            return "it had no mission"
         return f"its mission is not ended: {error}"
     return "its mission is ended"
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal
 
 import typer
 
-from fognav.operate.fog import find_fog
+from fognav.operate.fog import Fog, RefusedError, find_fog
 from fognav.operate.options import FogOption, JsonOption, checked_id, duration, moment, numbers, points, weekly
 from fognav.output import WrongUseError, exit_codes, local_time, print_result
 from fognav.programs import MAP_SERVICE
@@ -88,19 +88,22 @@ def zone_add(  # noqa: PLR0913  # each option is an argument
         }
         body |= {name: value for name, value in optional.items() if value is not None}
         method, path = ("PUT", f"{_ZONES}/{identifier}") if replace else ("POST", _ZONES)
-        made = find_fog(fog).send(method, MAP_SERVICE, path, body)
-        print_result(made, _line(made), json=json)
+        service = find_fog(fog)
+        made = service.send(method, MAP_SERVICE, path, body)
+        print_result(made, _line(made), *_without_a_clock(service, [made]), json=json)
 
 
 @zone_app.command("list", epilog="Example: fognav zone list --json")
 def zone_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """List all zones."""
     with exit_codes():
-        found = find_fog(fog).get(MAP_SERVICE, _ZONES)
+        service = find_fog(fog)
+        found = service.get(MAP_SERVICE, _ZONES)
         lines = [
             _line(zone) + ("" if zone["id"] in found["active"] else " (has no effect now)") for zone in found["zones"]
         ]
-        print_result(found, *(lines or ["no zones"]), json=json)
+        active = [zone for zone in found["zones"] if zone["id"] in found["active"]]
+        print_result(found, *(lines or ["no zones"]), *_without_a_clock(service, active), json=json)
 
 
 @zone_app.command("show", epilog="Example: fognav zone show z-1a2b3c4d")
@@ -195,6 +198,21 @@ def _shape(
     if polygon is not None:
         return {"type": "polygon", "points": points(polygon, 3, "a polygon")}
     return {"type": "corridor", "line": points(str(corridor), 2, "a corridor"), "width": width}
+
+
+def _without_a_clock(fog: Fog, zones: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return why zones are in force outside their times: the map-service knows no time of day. Empty if it does."""
+    # The end of a time to live (`ttl_s`) is told by the clock that nobody sets.
+    if not any(
+        zone["starts_at"] or zone.get("schedule") or (zone["expires_at"] and not zone.get("ttl_s")) for zone in zones
+    ):
+        return []
+    try:
+        ready = fog.get(MAP_SERVICE, "/readyz")
+    except RefusedError as error:  # it lacks something else, and says so of the clock all the same
+        ready = error.problem
+    clock = ready.get("parts", {}).get("clock", {}).get("detail")
+    return [clock] if clock else []
 
 
 def _line(zone: Mapping[str, Any]) -> str:

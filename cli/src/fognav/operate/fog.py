@@ -25,6 +25,21 @@ TOKEN: Final = "FOGNAV_TOKEN"  # noqa: S105  # a variable's name
 TOKEN_FILE: Final = "FOGNAV_TOKEN_FILE"  # noqa: S105  # same
 _GIVE_TOKEN: Final = f"Set {TOKEN} to an operator's token, or {TOKEN_FILE} to a file that holds it"
 
+_IN_COMMANDS: Final[Mapping[str, str]] = {
+    "alerts": "`fognav alert list`",
+    "areas": "`fognav area list`",
+    "floors": "`fognav floor list`",
+    "masks/keepout.png": "`fognav map export nav2`",
+    "nodes": "`fognav node list`",
+    "places": "those that are known",
+    "robots": "those that are known",
+    "schedules": "`fognav mission schedules`",
+    "store": "`fognav store status`",
+    "zone-sets": "`fognav zone list`",
+    "zones": "`fognav zone list`",
+}
+"""What a command says for a route of the services' problem documents, which speak to programs that use REST."""
+
 
 class RefusedError(FailedError):
     """A service refused a request; `status`, `code` and `reason` are those of its problem document."""
@@ -152,8 +167,16 @@ class Fog:
             problem = response.body if isinstance(response.body, dict) else {}
             remedy = _GIVE_TOKEN if response.status == http.client.UNAUTHORIZED else str(problem.get("remedy", ""))
             words = ". ".join(part for part in (f"the {service} refused it: {response.reason}", remedy) if part)
-            raise RefusedError(words, response.status, response.body)
+            raise RefusedError(_in_commands(words), response.status, response.body)
         return response
+
+
+def _in_commands(text: str) -> str:
+    """Return what a problem document says, in the words of the command."""
+    named = re.sub(r"GET /api/v1/([a-z-]+(?:/[a-z.]+)*)", lambda found: _IN_COMMANDS.get(found[1], found[0]), text)
+    return re.sub(
+        r"`(?:detail|errors)` names", "it names", re.sub(r", or (?:POST|PUT) a new one", ", or add one", named)
+    )
 
 
 def find_fog(address: str | None) -> Fog:

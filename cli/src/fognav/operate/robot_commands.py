@@ -279,10 +279,20 @@ class _Stop:
             self._over.wait(RETRY_S)
 
     def _by_planner(self) -> Outcome:
-        return stop_by_planner(self._fog, self._fog.robot(self._chosen))
+        return stop_by_planner(self._fog, self._robot())
 
     def _direct(self) -> Outcome:
-        return asyncio.run(self._send(self._fog.robot(self._chosen)))
+        return asyncio.run(self._send(self._robot()))
+
+    def _robot(self) -> str:
+        try:
+            return self._fog.robot(self._chosen)
+        except RefusedError as error:  # a stop needs no token, but the list of robots does
+            if error.status not in (http.client.UNAUTHORIZED, http.client.FORBIDDEN):
+                raise
+            raise WrongUseError(
+                f"name the robot with --robot: then no token is needed. Without a name, {error}"
+            ) from error
 
     async def _send(self, robot: str) -> Outcome:
         task = asyncio.current_task()

@@ -606,6 +606,7 @@ def test_accepted_goal_says_what_a_robot_that_stands_waits_for(demo: Service, mo
     demo.answers["PUT", "/api/v1/robots/r1/goal"] = (200, {})
     demo.answers["GET", "/api/v1/robots"] = (200, [{**ROBOT, "state": {**ROBOT["state"], "mode": mode}}])
     assert json.loads(run("robot", "goal", "b", "--json"))["reason"] == said
+    assert ("fognav robot reset" in run("robot", "status")) is (mode == "FAULT")
 
 
 def test_refused_goal_is_reported_with_its_reason_and_exit_code_1(demo: Service) -> None:

@@ -257,6 +257,8 @@ def robot_status(*, robot: RobotOption = None, fog: FogOption = None, json: Json
             print_json({"mode": mode, "reasons": view["state"]["reasons"] if view["state"] else [], **view})
             return
         print_answer(f"{view['id']}: {_describe(view['state'], view['pose'])}")
+        if mode == "FAULT":
+            print_answer("  look at the robot and mend the cause, then: fognav robot reset, fognav robot enable")
         if (out := view.get("out_of_service")) is not None:
             until = (
                 "" if out["until"] is None else time.strftime(", until %Y-%m-%d %H:%M", time.localtime(out["until"]))

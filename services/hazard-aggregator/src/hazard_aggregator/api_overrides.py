@@ -129,7 +129,7 @@ def require_allowed(state: OverrideState, ttl_s: float, caller: Caller) -> None:
         detail = f"to declare an area clear needs the role admin; {caller.name} has the role {caller.role}"
         raise ProblemError(AreaProblem.CLEAR_NEEDS_ADMIN, detail)
     if ttl_s > (longest := LONGEST_S[state]):
-        detail = f"an area can be overridden as {state} for {longest:g} s at most"
+        detail = f"an area can be overridden as {state} for {longest:.0f} s at most"
         raise ProblemError(AreaProblem.OVERRIDE_TOO_LONG, detail, field="body.ttl_s")
 
 

@@ -256,6 +256,8 @@ def test_status_shows_addresses_token_and_processes(demo: Service, tmp_path: Pat
     assert shown["urls"]["planner"] == demo.url
     assert shown["pids"] == {}
     assert shown["connected"] is None, "its router can't be reached"
+    told = run("status")
+    assert ("connected not visible" in " ".join(told.split()), "router_unreachable" in told) == (True, False)
 
 
 def test_status_of_a_fog_node_that_does_not_answer_fails() -> None:
@@ -633,9 +635,10 @@ def test_stop_needs_neither_key_nor_token_and_takes_the_way_that_works(service: 
         output = run("robot", command, code=1)
         assert "the zenoh router tcp/127.0.0.1:1 can't be reached" in output
         assert "the planner refused it" in output
-        answer = {"accepted": True, "reason": "disabled", "mode": "NORMAL"}
+        answer = {"accepted": True, "reason": "disabled; the mode is INIT", "mode": "NORMAL"}
         service.answers["POST", "/api/v1/robots/r1/stop"] = (200, answer)
-        assert run("robot", command).startswith("accepted: disabled")
+        stopped = run("robot", command)
+        assert (stopped.startswith("accepted: disabled; the mode is INIT"), "NORMAL" in stopped) == (True, False)
 
 
 def test_stop_without_a_valid_token_names_no_robot_says_how_and_stops_the_floor(demo: Service) -> None:

@@ -309,7 +309,10 @@ async def _cancel(fog: Fog, robot: str) -> Outcome:
 
 def _report(outcome: Outcome, *, json: bool) -> None:
     """Print what became of a command and end it: with exit code 1 if it was refused."""
-    line = f"{'accepted' if outcome.accepted else 'refused'}: {outcome.reason} (mode {outcome.mode})"
+    line = f"{'accepted' if outcome.accepted else 'refused'}: {outcome.reason}"
+    # The robot's own answer is newer than its last state, which may still have the mode before.
+    if outcome.mode is not None and "the mode is " not in outcome.reason:
+        line += f" (mode {outcome.mode})"
     print_result(msgspec.to_builtins(outcome), line, json=json)
     raise typer.Exit(0 if outcome.accepted else NOT_TRUE)
 

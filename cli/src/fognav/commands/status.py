@@ -8,6 +8,7 @@ from typing import Final
 
 import msgspec
 
+from fog_runtime import logs
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -84,8 +85,9 @@ def _show(system: System, present: list[str] | None, ends: dt.datetime | None) -
         print_answer(f"  {name:18} {url}")
     if system.token_file:
         print_answer(f"  {'token':18} {system.token_file}")
-    if present is not None:
-        print_answer(f"  {'connected':18} {', '.join(present) or 'nothing'}")
+    if ROUTER in system.urls:
+        shown = "not visible" if present is None else ", ".join(present) or "nothing"
+        print_answer(f"  {'connected':18} {shown}")
     if ends is not None:
         soon = ends - dt.datetime.now(dt.UTC) < _SOON
         print_answer(f"  {'certificates':18} valid until {ends:%Y-%m-%d}" + (": see fognav doctor" if soon else ""))
@@ -107,6 +109,9 @@ def connected(system: System, credentials: Credentials) -> list[str] | None:
     """
     if ROUTER not in system.urls or not system.site:
         return None
+    if system.urls[ROUTER].startswith("tls/") and "zenoh" not in credentials.passwords:
+        return None  # a person's token is for REST: the router admits programs
+    logs.configure("fognav", "error", "text")
     return asyncio.run(_connected(system.urls[ROUTER], system.site, credentials))
 
 

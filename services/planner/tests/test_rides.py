@@ -55,6 +55,7 @@ def test_robot_goes_on_only_while_the_lift_stands_open_for_this_ride(facts, stat
     [
         ("ground", Facts(GROUND, RIDE), None, None),
         ("ground", Facts(GROUND, RIDE, at_goal=True), None, ("r1/3", "AGV_MODE", "ground")),
+        ("ground", Facts(GROUND, RIDE, at_goal=True), lift(session="r1/2"), ("r1/2", "END_SESSION", "ground")),
         ("ground", Facts(GROUND, structs.replace(RIDE, boards=True)), lift(), ("r1/3", "AGV_MODE", "ground")),
         ("ground", Facts(GROUND), lift(), ("r1/3", "END_SESSION", "ground")),
         ("ground", Facts(GROUND, None, cabins=CABIN), lift(), ("r1/3", "AGV_MODE", "ground")),

@@ -77,7 +77,8 @@ def request(  # noqa: PLR0911  # each part of a ride has its own answer
     if not facts.silent:
         if given is not None and given.lift == name:
             return _call(own, floor)
-        if ride is not None and ride.lift == name and (facts.at_goal or ride.boards):
+        before = lift is not None and lift.session_id == own  # its last ride, which ends first
+        if ride is not None and ride.lift == name and (facts.at_goal or ride.boards) and not before:
             return _call(following, floor)
     if lift is None or lift.session_id not in (own, following):
         return None

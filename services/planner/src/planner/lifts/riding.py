@@ -93,13 +93,14 @@ class Riding:
     async def step(self) -> None:
         """Do what is due for each robot, then ask the lifts."""
         missions = self._service.missions
-        for robot in {*missions.said, *missions.berths}:
+        robots = {*missions.said, *missions.berths, *missions.goals}
+        for robot in robots:
             try:
                 await self._step(robot)
             except (StoreError, CommandError) as error:
                 _log.warning("ride_delayed", robot=robot, reason=str(error))
         for lift in self._site.lifts:
-            for robot in {*missions.berths, *missions.goals}:
+            for robot in robots:
                 state = self._lift(lift.id)
                 if (asked := request(lift.id, robot, self._facts(robot), state, self._site.id)) is not None:
                     self._zenoh.publish(ch.LIFT_REQUEST, asked, lift=lift.id)

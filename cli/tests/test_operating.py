@@ -550,6 +550,23 @@ def test_goal_on_another_floor_is_a_way_by_the_lift(demo: Service) -> None:
     assert demo.requests[0][2] == {"place": "desk", "floor": "upstairs"}
 
 
+def test_stops_of_a_mission_may_be_on_other_floors(demo: Service) -> None:
+    stops = [
+        {"place": "desk", "pose": None, "floor": "upstairs", "state": "present"},
+        {"place": None, "pose": {"x": 1.0, "y": 2.0}, "floor": "cellar", "state": "ahead"},
+        {"place": None, "pose": None, "floor": "attic", "state": "ahead"},
+    ]
+    made = {"robot": "r1", "stops": stops, "deadline": None, "aside": None}
+    demo.answers["PUT", "/api/v1/robots/r1/mission"] = (201, made)
+    demo.answers["GET", "/api/v1/robots"] = (200, [ROBOT])
+    told = run("mission", "send", "upstairs:desk", "cellar:1,2")
+    assert told == "r1: upstairs:desk (on the way), cellar:(1.00, 2.00), the lift to attic"
+    assert demo.requests[0][2]["stops"] == [  # type: ignore[index]  # a mission's
+        {"place": "desk", "floor": "upstairs"}, {"pose": {"x": 1.0, "y": 2.0}, "floor": "cellar"},
+    ]  # fmt: skip
+    assert "'': an id has only" in run("mission", "send", ":desk", code=2)
+
+
 def test_mission_by_the_clock_says_what_is_asked_for_and_what_became_of_the_last_one(demo: Service) -> None:
     times = [{"days": ["mon", "tue"], "begin": "08:00", "end": "09:00"}]
     last = {"begin": 0.0, "outcome": "missed", "reason": "robot r1 has another mission"}

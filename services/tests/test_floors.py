@@ -49,6 +49,7 @@ robots = [
     {{ id = "r1", start = {{ x = 1.0, y = 1.0, theta = 0.0 }}, radius = 0.17 }},
     {{ id = "r2", start = {{ x = 1.0, y = 1.0, theta = 0.0 }}, radius = 0.17 }},
     {{ id = "r3", start = {{ x = 1.0, y = 1.0, theta = 0.0 }}, radius = 0.17 }},
+    {{ id = "r5", start = {{ x = 1.0, y = 1.0, theta = 0.0 }}, radius = 0.17 }},
     {{ id = "r4", start = {{ x = 3.0, y = 1.5, theta = 0.0 }}, radius = 0.17 }},
 ]
 [places.desk]
@@ -88,7 +89,7 @@ def floors(tmp_path_factory: pytest.TempPathFactory, open_fog: Any) -> dict[str,
 @pytest.fixture(scope="module")
 def names() -> Iterator[str]:
     """Return ids of robots, one for each test."""
-    return iter(("r1", "r2", "r3"))
+    return iter(("r1", "r2", "r3", "r5"))
 
 
 class Machine:
@@ -207,7 +208,7 @@ class Robot:
         return RobotState(
             mode="NORMAL", reasons=[], enabled=True, battery=None, map_epoch=0, map_seq=0, plan_id=None,
             goal_id=self.goal.goal_id if has and self.goal else None, goal_reached=has, boot=self.boot,
-            clock=time.monotonic(), berth=self.berth, floors=list(self.floors),
+            clock=time.monotonic(), berth=self.berth, floors=list(self.floors), carries_missions=True,
         )  # fmt: skip
 
 
@@ -232,14 +233,15 @@ class Building:
                 method, f"/api/v1/robots/{self.robot.name}{path}", headers=self.tokens["operator"], **body
             )
 
-    async def send_up(self) -> None:
+    async def send_up(self, path: str = "/floor", body: Any = None) -> None:
         """Order the ride once the planner has heard of the robot."""
+        body = body or {"floor": "upstairs", "place": "desk"}
         for _ in range(600):
-            answer = await self.call("ground", "PUT", "/floor", json={"floor": "upstairs", "place": "desk"})
+            answer = await self.call("ground", "PUT", path, json=body)
             if answer.status_code != 504:
                 break
             await asyncio.sleep(0.1)
-        assert answer.status_code == 200, answer.text
+        assert answer.status_code in {200, 201}, answer.text
 
     async def records(self) -> dict[str, tuple[str, int, bool] | None]:
         """Return what each floor has stored of the robot: its floor, epoch, and whether it is still in the lift."""
@@ -344,6 +346,28 @@ async def test_robot_waits_in_the_lift_for_a_floor_whose_planner_is_down_and_get
     await upstairs.ready("planner")
     assert (await building.call("upstairs", "GET", "/goal")).status_code == 404
     assert len({goal for _, goal, _ in robot.goals}) == 3
+
+
+async def test_mission_goes_on_upstairs_and_back_again_although_both_planners_die(building, until) -> None:
+    robot, floors = building.robot, building.floors
+    stops = [
+        {"pose": {"x": 2.0, "y": 1.0}}, {"floor": "upstairs", "place": "desk"},
+        {"floor": "upstairs", "pose": {"x": 1.0, "y": 5.0}}, {"floor": "ground", "place": "desk"},
+    ]  # fmt: skip
+    await building.send_up("/mission", {"stops": stops})
+    for count, name in ((3, "ground"), (4, "upstairs")):
+        await until(lambda count=count: len(robot.goals) >= count, "its next goals", lambda: str(robot.goals))
+        floors[name].kill("planner")
+        floors[name].start("planner")
+    await until(lambda: len(robot.goals) == 8, "its last goal", lambda: f"{robot.goals} {building.lift[-1:]}")
+    wait, cabin = (4.0, 2.0), (6.8, 2.0)
+    assert [(floor, at) for floor, _, at in robot.goals] == [
+        ("ground", (2.0, 1.0)), ("ground", wait), ("ground", cabin), ("upstairs", (3.0, 5.0)), ("upstairs", (1.0, 5.0)),
+        ("upstairs", wait), ("upstairs", cabin), ("ground", (2.0, 5.0)),
+    ]  # fmt: skip
+    assert len({goal.rpartition("-")[0] for _, goal, _ in robot.goals}) == 1, "one mission"
+    await until(lambda: building.lift[-1].session_id == "", "the lift is free")
+    assert (await building.records())["ground"] == ("ground", 2, False)
 
 
 @pytest.mark.drive

@@ -26,7 +26,7 @@ from console_service.page_files import PageFiles
 from fog_contracts.messages import AreaDefinition, AreaHazard, RobotPose, RobotState, WeeklySchedule, WeeklyTime
 from fog_supervisor import net
 from planner.schedules.api import ScheduleView
-from planner.stops import GoalBody, GoalPose, MissionBody
+from planner.stops import GoalPose, MissionBody, StopBody
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -61,7 +61,8 @@ def robot_pose(x: float, y: float, theta: float) -> RobotPose:
 def schedule(name: str, *, begin: float | None, **changed: object) -> dict[str, object]:
     """Return a mission by the clock as the planner lists it, whose next window begins at a time."""
     weekly = WeeklySchedule(time_zone="Asia/Tokyo", times=[WeeklyTime(days=["mon"], begin="08:00", end="09:00")])
-    mission = MissionBody(stops=[GoalBody(place="a"), GoalBody(pose=GoalPose(x=3.0, y=4.5))], deadline_s=600.0)
+    stops = [StopBody(place="a"), StopBody(pose=GoalPose(x=3.0, y=4.5)), StopBody(place="a", floor="upstairs")]
+    mission = MissionBody(stops=stops, deadline_s=600.0)
     view = ScheduleView(
         id=name, robot="r2", mission=mission, weekly=weekly, author="ana", since=1.0, version="7", next=begin, waits="",
         waits_code="",

@@ -37,12 +37,13 @@ export type PublicPlace = Schemas["PublicPlace"];
 export type RobotPose = Schemas["RobotPose"];
 export type RobotState = Schemas["RobotState"];
 export type ScheduleBody = Omit<Sent<Schemas["ScheduleBody"], "robot" | "weekly">, "mission"> & {
-  readonly mission: Omit<Sent<Schemas["MissionBody"]>, "stops"> & { readonly stops: readonly GoalBody[] };
+  readonly mission: Omit<Sent<Schemas["MissionBody"]>, "stops"> & { readonly stops: readonly StopBody[] };
 };
 export type ScheduledMission = Schemas["ScheduleView"];
 export type ServiceBody = Sent<Schemas["ServiceBody"], "reason">;
 export type SetView = Schemas["SetView"];
 export type Shape = Schemas["Zone"]["shape"];
+export type StopBody = Sent<Schemas["StopBody"]>;
 export type TimelineEntry = Schemas["TimelineEntry"];
 export type Visit = Schemas["VisitView"];
 export type VisitBody = Schemas["VisitBody"];

@@ -108,6 +108,7 @@ export const PT_CODES: Readonly<Record<string, string>> = {
   out_of_service: "O robô está fora de serviço, ou noutro piso.",
   no_lift: "Nenhum elevador leva a esse piso.",
   floor_unknown: "O robô não conhece esse piso.",
+  robot_outdated: "O programa do robô não sabe levar uma missão para outro piso: atualize-o.",
   overloaded: "O serviço tem demasiados pedidos: tente daqui a pouco.",
   override_too_long: "Uma área não pode ficar definida à mão por tanto tempo.",
   place_changed: "Alguém alterou o lugar: volte a lê-lo.",

@@ -1,7 +1,7 @@
 // Missions that begin by the clock: what runs when, what became of it, and the form of one.
 import { useRef, useState } from "preact/hooks";
 import { Problem, request } from "../api/client";
-import type { ScheduleBody, ScheduledMission } from "../api/types";
+import type { ScheduleBody, ScheduledMission, StopBody } from "../api/types";
 import { mayOperate, useConsole, useLive, useRead, useShown } from "../context";
 import { said } from "../i18n/codes";
 import { t } from "../i18n/i18n";
@@ -21,8 +21,6 @@ const AGAIN_MS = 5_000;
 
 /** What to do when every way to a stop is cut. */
 const CUTS = ["wait", "cancel", "nearest"] as const;
-
-type Stop = ScheduleBody["mission"]["stops"][number];
 
 const pathOf = (id: string): string => `schedules/${encodeURIComponent(id)}`;
 const tagOf = ({ version }: ScheduledMission): Record<string, string> => ({ "If-Match": `"${version}"` });
@@ -122,9 +120,17 @@ function lastText({ last, weekly }: ScheduledMission): string {
   return last?.outcome === "missed" ? t("schedules.missed", { time, reason: said(last.code, last.reason) }) : t("schedules.given", { time });
 }
 
-function stopText({ of }: Live, { place, pose }: Stop): string {
-  if (place) return of.place.get(place)?.label || place;
-  return pose ? t("goal.position", { x: decimal(pose.x, 1), y: decimal(pose.y, 1) }) : "–";
+/** The other floor of a stop, whose places are not this one's. */
+const elsewhere = ({ site }: Live, { floor }: StopBody): string => (floor && floor !== site ? `${floor}: ` : "");
+
+/** What the form's list of places has for a stop: for a place of another floor something that is no place's id here. */
+const choiceOf = (live: Live, stop: StopBody): string => (stop.place ? elsewhere(live, stop) + stop.place : "");
+
+function stopText(live: Live, stop: StopBody): string {
+  const away = elsewhere(live, stop);
+  const { place, pose } = stop;
+  if (place) return away + ((away === "" && live.of.place.get(place)?.label) || place);
+  return away + (pose ? t("goal.position", { x: decimal(pose.x, 1), y: decimal(pose.y, 1) }) : "–");
 }
 
 interface Props {
@@ -184,11 +190,11 @@ function ScheduleForm({ base: known, onDone }: Props): preact.JSX.Element {
         {stops.map((stop, index) => (
           <div key={index} class="fields beside">
             <label>{t("schedules.place", { number: index + 1 })}
-              <select value={stop.place ?? ""} required={!stop.pose} onChange={(event) => {
+              <select value={choiceOf(live, stop)} required={!stop.pose} onChange={(event) => {
                 const place = event.currentTarget.value;
                 setMission({ stops: stops.map((other, i) => (i === index ? { place } : other)) });
               }}>
-                {!live.of.place.has(stop.place ?? "") && <option value={stop.place ?? ""}>{stopText(live, stop)}</option>}
+                {!live.of.place.has(choiceOf(live, stop)) && <option value={choiceOf(live, stop)}>{stopText(live, stop)}</option>}
                 {places.map(([name, label]) => <option key={name} value={name}>{label}</option>)}
               </select>
             </label>

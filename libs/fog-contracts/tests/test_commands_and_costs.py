@@ -1,9 +1,12 @@
+import hmac
+
 import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from msgspec.structs import replace
 
 from fog_contracts import messages as m
 from fog_contracts.channels import ROBOT_COMMAND
@@ -41,6 +44,19 @@ def test_signed_command_is_accepted_exactly_once_after_encoding(age):
     received = decode(ROBOT_COMMAND, encode(ROBOT_COMMAND, sign(command(), KEY)), m.RobotCommand)
     assert gate.refusal(received, 100.0 + age) is None
     assert gate.refusal(received, 100.0 + age).code == "repeated"
+
+
+def test_hand_over_is_signed_with_its_mission_and_without_one_as_robots_of_before_sign_it():
+    given_over = m.HandOver(origin="ground", floor="upstairs", epoch=1, who="anna")
+    unsigned = command(kind="hand_over", given=given_over)
+    told = msgspec.msgpack.decode(encode(ROBOT_COMMAND, unsigned))
+    assert told["given"].pop("mission") is None
+    assert sign(unsigned, KEY).signature == hmac.digest(KEY, msgspec.msgpack.encode(told), "sha256")
+    carrying = sign(command(kind="hand_over", given=replace(given_over, mission=m.Tour(id="t"))), KEY)
+    other = replace(carrying, given=replace(given_over, mission=m.Tour(id="t", ahead=(m.Stop(place="b"),))))
+    assert CommandGate("r1", KEY, "b1").refusal(other, 100.0).code == "not_signed"
+    received = decode(ROBOT_COMMAND, encode(ROBOT_COMMAND, carrying), m.RobotCommand)
+    assert CommandGate("r1", KEY, "b1").refusal(received, 100.0) is None
 
 
 @given(wait=st.floats(0.0, 30.0), first=st.floats(0.0, VALID_S))

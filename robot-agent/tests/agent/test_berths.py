@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import pytest
 from little_world import AGENT, L_PATH, LittleWorld
 
-from fog_contracts.messages import Berth, HandOver
+from fog_contracts.messages import Berth, HandOver, Stop, Tour
 from fog_runtime.configuration.settings import SettingsError
 from robot_agent.agent import berths
 from robot_agent.agent.berths import read_berths
@@ -42,7 +42,8 @@ cabin = { x = 8.0, y = 2.0, theta = 3.1 }
 wait = { x = 6.0, y = 2.0, theta = 0.0 }
 floors = ["ground", "upstairs"]
 """
-UP = HandOver(origin="ground", floor="upstairs", epoch=1, lift="north", who="anna")
+MISSION = Tour(id="t", leg=2, ahead=(Stop(place="desk"), Stop(floor="ground", place="desk")))
+UP = HandOver(origin="ground", floor="upstairs", epoch=1, lift="north", who="anna", mission=MISSION)
 
 
 def settings(tmp_path: Path, text: str = FLOORS) -> Settings:
@@ -122,6 +123,7 @@ ON_FLOORS = replace(AGENT, berth=FIRST, floors=("ground", "upstairs"))
 def test_robot_takes_a_hand_over_while_it_stands_and_says_what_it_has_stored_until_it_ends() -> None:
     world = LittleWorld(config=ON_FLOORS).ready()
     assert (world.state().berth, world.state().floors) == (FIRST, ["ground", "upstairs"])
+    assert world.state().carries_missions
     world.drive_to(L_PATH)
     world.run(3.0)
     assert world.command("hand_over", given=UP).code == "driving"

@@ -7,6 +7,7 @@ import itertools
 from datetime import datetime
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
+from unittest.mock import Mock
 from zoneinfo import ZoneInfo
 
 import msgspec
@@ -38,7 +39,7 @@ from planner.core import PlannerCore
 from planner.schedules.occasions import LONGEST_PAUSE_S, IdleTimes, due
 from planner.schedules.persistence import SchedulePersistence
 from planner.schedules.scheduling import RETRY_S, Scheduling
-from planner.stops import GoalBody, MissionBody, Occasion, Order, ScheduledMission
+from planner.stops import MissionBody, Occasion, Order, ScheduledMission, StopBody
 from planner.store import Store, StoredGoal
 from planner.visiting import Visiting
 
@@ -54,7 +55,7 @@ def scheduled(name: str = "post", robot: str = "r1", stop: str = "lab", **fields
     """Return a mission that begins between eight and nine from Monday to Friday, written on the Sunday before."""
     days = fields.pop("days", ["mon", "tue", "wed", "thu", "fri"])
     weekly = WeeklySchedule(time_zone=LISBON, times=[WeeklyTime(days=days, begin="08:00", end="09:00")])
-    mission = MissionBody(stops=[GoalBody(place=stop)], priority=fields.pop("priority", 0))
+    mission = MissionBody(stops=[StopBody(place=stop)], priority=fields.pop("priority", 0))
     filled = {"author": "anna", "since": EIGHT - DAY, "version": f"{name}-1", **fields}
     return ScheduledMission(id=name, robot=robot, mission=mission, weekly=weekly, **filled)
 
@@ -137,6 +138,7 @@ class Fog:
             heard=self.states.get, is_doubled=lambda _: False, overruled=None, send=self._command
         )
         self.refusal: Refusal | None = None
+        self.riding = SimpleNamespace(floor="fog", check=Mock(), first_leg=lambda _robot, stop, *_: (stop, None))
         self.synchronized = True
         self.places: dict[str, Place] = site.places
         self.visiting = Visiting(cast("Any", self), site, cast("Any", clock))

@@ -9,13 +9,26 @@ import random
 import secrets
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from manual_clock import ManualClock
 
-from fog_contracts.messages import OutOfService, Place, PlanReply, PlanRequest, Pose, Refusal, RobotGoal, RobotPath
+from fog_contracts.messages import (
+    OutOfService,
+    Place,
+    PlanReply,
+    PlanRequest,
+    Pose,
+    Refusal,
+    RobotGoal,
+    RobotPath,
+    Stop,
+    Tour,
+    WhenCut,
+)
 from fog_runtime.health import Health
 from fog_runtime.http import ProblemError
 from fog_runtime.stores.redis_store import Audit
@@ -24,13 +37,10 @@ from planner.core import PlannerCore
 from planner.stops import (
     CUT_S,
     CutTimes,
-    GoalBody,
     GoalPose,
     MissionBody,
     Order,
-    Stop,
-    Tour,
-    WhenCut,
+    StopBody,
     act_on_cut,
     best_order,
     leg_aside,
@@ -441,6 +451,7 @@ class Planner:
     def __init__(self, localized: bool = True) -> None:  # noqa: FBT001, FBT002  # because it is the only thing to say
         self.poses: dict[str, Any] = {"r1": SimpleNamespace(x=10.0, y=0.0, theta=0.0, localized=localized)}
         self.planned = 0
+        self.riding = SimpleNamespace(floor="ground", check=Mock(), first_leg=lambda _robot, stop, *_: (stop, None))
 
     async def preview(self, request: PlanRequest, asker: str) -> PlanReply:
         assert asker == "person anna"
@@ -457,7 +468,7 @@ class Planner:
 
 
 def ordered(planner: Planner, *xs: float, **options: Any) -> list[float]:
-    body = MissionBody(stops=[GoalBody(pose=GoalPose(x=x, y=0.0)) for x in xs], **options)
+    body = MissionBody(stops=[StopBody(pose=GoalPose(x=x, y=0.0)) for x in xs], **options)
     conditions = Conditions("anna", None, None)
     places = {"lab": Place(x=1.0, y=0.0)}
     made = asyncio.run(mission_order(cast("Any", planner), "r1", body, places, conditions, 0.25))

@@ -27,7 +27,10 @@ mission_app = typer.Typer(help="Send robots to several stops, now or by the cloc
 
 _SCHEDULES: Final = "/api/v1/schedules"
 Stops = Annotated[
-    list[str], typer.Argument(metavar="STOP…", help="Places of the site, or X,Y[,THETA] in metres and radians.")
+    list[str],
+    typer.Argument(
+        metavar="STOP…", help="Places of the site, or X,Y[,THETA] in metres and radians; on another floor FLOOR:STOP."
+    ),
 ]
 ScheduleId = Annotated[str, typer.Argument(metavar="ID", help="The schedule's id: a to z, 0 to 9 and -.")]
 BestOption = Annotated[bool, typer.Option("--best", help="In the order with the shortest way; 8 stops at most.")]
@@ -158,7 +161,13 @@ def _mission(  # each option is an argument
     cut = {"do": when_cut, **({} if limit is None else {"limit_s": duration(limit, "--limit")})}
     ends = {} if deadline is None else {"deadline_s": duration(deadline, "--deadline")}
     order = "best" if best else "given"
-    return {"stops": [goal_body(stop) for stop in stops], "order": order, "priority": priority, "when_cut": cut, **ends}
+    found = [_stop_body(stop) for stop in stops]
+    return {"stops": found, "order": order, "priority": priority, "when_cut": cut, **ends}
+
+
+def _stop_body(text: str) -> dict[str, object]:
+    floor, colon, goal = text.rpartition(":")
+    return {**goal_body(goal), **({"floor": checked_id(floor)} if colon else {})}
 
 
 def _line(mission: Mapping[str, Any]) -> str:
@@ -170,7 +179,10 @@ def _line(mission: Mapping[str, Any]) -> str:
 
 
 def _stop(stop: Mapping[str, Any]) -> str:
-    return stop["place"] or "({x:.2f}, {y:.2f})".format(**stop["pose"])
+    floor = f"{stop['floor']}:" if stop.get("floor") else ""
+    if stop["place"] is None and stop["pose"] is None:  # it rides, and stays in the cabin
+        return f"the lift to {stop['floor']}"
+    return floor + (stop["place"] or "({x:.2f}, {y:.2f})".format(**stop["pose"]))
 
 
 def _schedule(schedule: Mapping[str, Any]) -> str:

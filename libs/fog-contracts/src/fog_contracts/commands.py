@@ -28,6 +28,9 @@ def _signature(command: RobotCommand, key: bytes) -> bytes:
     unsigned = msgspec.structs.asdict(msgspec.structs.replace(command, signature=b""))
     if command.given is None:
         del unsigned["given"]  # robots of an earlier version sign without it
+    elif command.given.mission is None:  # and so do they without this
+        unsigned["given"] = msgspec.structs.asdict(command.given)
+        del unsigned["given"]["mission"]
     return hmac.digest(key, msgspec.msgpack.encode(unsigned), "sha256")
 
 

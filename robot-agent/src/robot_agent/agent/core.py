@@ -478,7 +478,8 @@ class AgentCore:
         )
         if self._berth is None:
             return state
-        return replace(state, berth=self._config.berth, floors=list(self._config.floors))
+        floors = list(self._config.floors)
+        return replace(state, berth=self._config.berth, floors=floors, carries_missions=True)
 
     def finished_traces(self) -> list[Trace]:
         """Return the traces that were completed since the last call, each once: for histograms."""

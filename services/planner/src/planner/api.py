@@ -173,7 +173,7 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     _add_orders(routes, service, robots, places)
     _add_missions(routes, service, robots, places)
     add_undo(routes, service, robots.check)
-    add_floors(routes, service, site, robots.check_single)
+    add_floors(routes, service, service.riding, robots.check_single)
     add_schedules(routes, service, robots.check, places, standby)
     add_visits(Routes(app, "visits"), lambda: service.visiting, standby)
     _add_plan(Routes(app, "plan"), service, robots, places)
@@ -298,11 +298,14 @@ def _add_missions(routes: Routes, service: Service, robots: _Robots, places: Kno
     @routes.put(
         "/api/v1/robots/{robot}/mission",
         status=(200, 201),
-        raises=[BusyError, IdempotencyError, MissionConflictError, OutOfServiceError, StoreError],
+        raises=[BusyError, CommandError, IdempotencyError, MissionConflictError, OutOfServiceError, StoreError],
         problems=[
             PlannerProblem.NO_ROBOT,
             PlannerProblem.ROBOT_DOUBLED,
             PlannerProblem.NO_PLACE,
+            PlannerProblem.NO_LIFT,
+            PlannerProblem.FLOOR_UNKNOWN,
+            PlannerProblem.ROBOT_OUTDATED,
             PlannerProblem.NO_POSE,
             PlannerProblem.GOAL_REFUSED,
             PlannerProblem.DEADLINE_TOO_SOON,
@@ -317,6 +320,8 @@ def _add_missions(routes: Routes, service: Service, robots: _Robots, places: Kno
         idempotency_key: IdempotencyKey = None,
     ) -> Answer[MissionView]:
         """Send a robot to one stop after the other, instead of its mission. `DELETE …/goal` ends all of it.
+
+        Stops may be on other floors: the robot takes lifts there, and those floors' planners go on with the mission.
 
         With If-Match, only if it still has the leg that was read; with `If-None-Match: *`, only if it has no mission.
         """

@@ -41,6 +41,10 @@ class PlannerProblem(ProblemCode):
         "floor_unknown", 409, "The robot does not know that floor",
         "Add the floor to its list of floors, or send another one",
     )  # fmt: skip
+    ROBOT_OUTDATED = (
+        "robot_outdated", 409, "The robot's software can't take a mission to another floor",
+        "Bring its software to this version, or send it to one goal there",
+    )  # fmt: skip
     COMMAND_REFUSED = (
         "command_refused", 409, "The robot refuses: `refusal` and `causes` identify why",
         "Do what `causes` ask for, then repeat it",

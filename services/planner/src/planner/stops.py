@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple
 from msgspec import Meta, structs
 
 from fog_contracts.messages import (
+    STOPS_MAX,
     Author,
     Code,
     FloorGoal,
@@ -17,11 +18,15 @@ from fog_contracts.messages import (
     PlanRefusal,
     PointXY,
     Pose,
+    Priority,
     Radians,
     Sentence,
     Stamp,
+    Stop,
     TimeToLive,
+    Tour,
     WeeklySchedule,
+    WhenCut,
 )
 
 if TYPE_CHECKING:
@@ -30,59 +35,8 @@ if TYPE_CHECKING:
     from fog_runtime.clock import Clock
     from fog_runtime.stores.redis_store import Attempt
 
-STOPS_MAX: Final = 20
 BEST_MAX: Final = 8
 """Of more stops the best order is not searched."""
-
-
-class Stop(Message, frozen=True, kw_only=True):
-    """Where a robot is to go: a pose, that of a place or not; `any_heading`: its theta does not count."""
-
-    pose: Pose
-    place: Id | None = None
-    any_heading: bool = False
-
-
-class WhenCut(Message, frozen=True, kw_only=True):
-    """What to do when every way to a stop is cut: wait, cancel the mission, or drive to the nearest reachable point.
-
-    `limit_s`: after so long without a way to a stop, whatever refuses it, the mission ends all the same. It counts anew
-    for each stop, and after a restart.
-    """
-
-    do: Literal["wait", "cancel", "nearest"] = "wait"
-    limit_s: TimeToLive | None = None
-
-
-Priority = Annotated[int, Meta(ge=0, le=9)]
-
-
-class Tour(Message, frozen=True, kw_only=True):
-    """A mission beside its present goal, which is leg number `leg` of it.
-
-    `reached` and `ahead` are its stops before and behind the present one. `aside`: the present goal is only the
-    reachable point nearest to this stop; `nearest`: the last such point. `deadline` (s since the epoch): it ends then.
-    """
-
-    id: str
-    leg: int = 0
-    reached: tuple[Stop, ...] = ()
-    ahead: tuple[Stop, ...] = ()
-    when_cut: WhenCut = WhenCut()
-    priority: Priority = 0
-    deadline: Stamp | None = None
-    aside: Stop | None = None
-    nearest: PointXY | None = None
-
-    @property
-    def goal_id(self) -> str:
-        """The id of the present goal: another one for each leg."""
-        return f"{self.id}-{self.leg}"
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether another leg follows the present one."""
-        return self.aside is not None or bool(self.ahead)
 
 
 class Ride(Message, frozen=True, kw_only=True):
@@ -113,14 +67,21 @@ class GoalBody(Message, frozen=True, kw_only=True):
     pose: GoalPose | None = None
 
 
+class StopBody(GoalBody, frozen=True, kw_only=True):
+    """A stop: a goal, on another floor of the building if it names one (`Site.id`)."""
+
+    floor: Id | None = None
+
+
 class MissionBody(Message, frozen=True, kw_only=True):
     """A mission: its stops in the `given` order, or in the `best` one, whose way is the shortest (8 at most).
 
+    With stops on several floors the order is the given one.
     `when_cut`: what to do when no way leads to a stop. `deadline_s`: it ends so long after the order, whatever is left.
     Of equally urgent missions that of higher `priority` is planned first.
     """
 
-    stops: Annotated[list[GoalBody], Meta(min_length=1, max_length=STOPS_MAX)]
+    stops: Annotated[list[StopBody], Meta(min_length=1, max_length=STOPS_MAX)]
     order: Literal["given", "best"] = "given"
     when_cut: WhenCut = WhenCut()
     deadline_s: TimeToLive | None = None
@@ -183,6 +144,16 @@ def next_leg(tour: Tour, present: Stop) -> tuple[Stop, Tour]:
         return tour.aside, structs.replace(tour, leg=tour.leg + 1, aside=None)
     reached = (*tour.reached, present)
     return tour.ahead[0], structs.replace(tour, leg=tour.leg + 1, reached=reached, ahead=tour.ahead[1:], nearest=None)
+
+
+def carried(tour: Tour, origin: str, floor: str) -> Tour:
+    """Return a mission as a robot takes it along from the floor `origin` to `floor`, whose stops name none there."""
+
+    def read_there(stops: tuple[Stop, ...]) -> tuple[Stop, ...]:
+        named = ((stop, stop.floor or origin) for stop in stops)
+        return tuple(structs.replace(stop, floor=None if name == floor else name) for stop, name in named)
+
+    return structs.replace(tour, leg=tour.leg + 1, reached=read_there(tour.reached), ahead=read_there(tour.ahead))
 
 
 def leg_aside(tour: Tour, present: Stop, nearest: PointXY) -> tuple[Stop, Tour]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
-from fog_contracts.messages import Berth, Message, OutOfService, RobotGoal
+from fog_contracts.messages import Berth, FloorGoal, Message, OutOfService, RobotGoal, Stop, Tour
 from fog_runtime import logs
 from fog_runtime.stores import records
 from fog_runtime.stores.redis_store import ANY, Audit, Outcome, Table
-from planner.stops import Ride, ScheduledMission, Stop, Tour
+from planner.stops import Ride, ScheduledMission
 from planner.waits.persistence import LearnedStore
 
 if TYPE_CHECKING:
@@ -39,8 +39,10 @@ class StoredGoal(Message, frozen=True, kw_only=True):
 
     @property
     def stop(self) -> Stop:
-        """The goal as a stop."""
-        assert self.goal.pose is not None  # what is stored has a pose
+        """The stop that it leads to, by the lift or not."""
+        if self.ride is not None:
+            goal = self.ride.goal or FloorGoal()
+            return Stop(place=goal.place, pose=goal.pose, any_heading=goal.any_heading, floor=self.ride.floor)
         return Stop(pose=self.goal.pose, place=self.goal.place, any_heading=self.any_heading)
 
 

@@ -73,7 +73,7 @@ def type_text(kind: inspect.Type) -> str:  # noqa: C901, PLR0911  # one case per
             return kind.cls.__name__
         case inspect.LiteralType():
             return " \\| ".join(f"`{value}`" for value in kind.values)
-        case inspect.ListType():
+        case inspect.ListType() | inspect.VarTupleType():
             return f"list{_between(kind.min_length, kind.max_length)} of {type_text(kind.item_type)}"
         case inspect.TupleType():
             return f"({', '.join(type_text(each) for each in kind.item_types)})"
@@ -119,7 +119,7 @@ def _field(each: inspect.Field) -> Field:
             if len(rest) != 1:
                 break
             inner = rest[0]
-        elif isinstance(element, inspect.ListType):
+        elif isinstance(element, inspect.ListType | inspect.VarTupleType):
             inner = element.item_type
         elif isinstance(element, inspect.DictType):
             inner = element.value_type
@@ -169,7 +169,7 @@ def _collect(kind: inspect.Type, found: list[type[Message]]) -> None:
         case inspect.UnionType():
             for each in plain.types:
                 _collect(each, found)
-        case inspect.ListType():
+        case inspect.ListType() | inspect.VarTupleType():
             _collect(plain.item_type, found)
         case inspect.DictType():
             _collect(plain.value_type, found)

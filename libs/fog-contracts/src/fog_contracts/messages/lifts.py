@@ -1,10 +1,10 @@
-"""Lifts, in Open-RMF's words, and the hand-over of a robot from one floor of its building to another."""
+"""Lifts, in Open-RMF's words, and the hand-over of a robot, with its mission, from one floor to another."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from fog_contracts.messages.basics import Author, Count, Id, Message, Pose, Stamp
+from fog_contracts.messages.basics import Author, Count, Id, Message, PointXY, Pose, Stamp, TimeToLive
 
 Session = Annotated[str, Meta(max_length=64)]
 LiftRequestType = Literal["END_SESSION", "AGV_MODE"]
@@ -53,12 +53,70 @@ class FloorGoal(Message, frozen=True, kw_only=True):
     any_heading: bool = False
 
 
+class Stop(FloorGoal, frozen=True, kw_only=True):
+    """A stop of a mission, on its reader's floor unless it names another one, which knows where its places are."""
+
+    floor: Id | None = None
+
+    @property
+    def goal(self) -> FloorGoal:
+        """Where it is on its floor."""
+        return FloorGoal(place=self.place, pose=self.pose, any_heading=self.any_heading)
+
+
+class WhenCut(Message, frozen=True, kw_only=True):
+    """What to do when every way to a stop is cut: wait, cancel the mission, or drive to the nearest reachable point.
+
+    `limit_s`: after so long without a way to a stop, whatever refuses it, the mission ends all the same. It counts anew
+    for each stop, and after a restart.
+    """
+
+    do: Literal["wait", "cancel", "nearest"] = "wait"
+    limit_s: TimeToLive | None = None
+
+
+Priority = Annotated[int, Meta(ge=0, le=9)]
+STOPS_MAX: Final = 20
+Stops = Annotated[tuple[Stop, ...], Meta(max_length=STOPS_MAX)]
+
+
+class Tour(Message, frozen=True, kw_only=True):
+    """A mission beside its present goal, which is leg number `leg` of it.
+
+    `reached` and `ahead` are its stops before and behind the present one. `aside`: the present goal is only the
+    reachable point nearest to this stop; `nearest`: the last such point. `deadline` (s since the epoch): it ends then.
+    `who` ordered it.
+    """
+
+    id: Annotated[str, Meta(max_length=40)]
+    leg: Count = 0
+    reached: Stops = ()
+    ahead: Stops = ()
+    when_cut: WhenCut = WhenCut()
+    priority: Priority = 0
+    deadline: Stamp | None = None
+    aside: Stop | None = None
+    nearest: PointXY | None = None
+    who: Author = ""
+
+    @property
+    def goal_id(self) -> str:
+        """The id of the present goal: another one for each leg."""
+        return f"{self.id}-{self.leg}"
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether another leg follows the present one."""
+        return self.aside is not None or bool(self.ahead)
+
+
 class HandOver(Message, frozen=True, kw_only=True):
     """A robot's way from the floor `origin` to `floor`, which it carries itself (ADR 76).
 
     `epoch`: the robot's count of hand-overs after this one. `lift`: by which it rides; None: people carry it. `goal`:
     where it goes then. `who`: who sent it. `id`: no other one's, whatever the epochs (they may be restored); robots of
-    before give it back empty.
+    before give it back empty. `mission`: what the robot goes on with there, whose present stop is the goal; its stops
+    that name no floor are there. Only a robot that `carries_missions` understands it.
     """
 
     origin: Id
@@ -68,6 +126,7 @@ class HandOver(Message, frozen=True, kw_only=True):
     goal: FloorGoal | None = None
     who: Author = ""
     id: Annotated[str, Meta(max_length=32)] = ""
+    mission: Tour | None = None
 
 
 class Berth(Message, frozen=True, kw_only=True):

@@ -368,7 +368,8 @@ class RobotState(Message, frozen=True, kw_only=True):
     `docked`: it stands on its dock. `wants_dock`: it asks the planner for the goal in front of its dock.
     `places`: where on the map it may be, most likely first, while its scans do not decide; empty otherwise.
     `codes` identifies each of the `reasons`, in their order (`ReasonCode`); a newer robot may have others.
-    `berth`: which floor it is on by its own record, None for one that knows no other; `floors`: all that it knows.
+    `berth`: which floor it is on by its own record, None for one that knows no other; `floors`: all that it knows;
+    `carries_missions`: it takes a mission along to them (`HandOver.mission`).
     `awaits_operator`: it does not drive before an operator enables or resets it. `base_fault` identifies the fault that
     the guardian has latched: a base may have its own.
     """
@@ -402,6 +403,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     base_fault: Code = ""
     berth: Berth | None = None
     floors: Annotated[list[Id], Meta(max_length=200)] = []
+    carries_missions: bool = False
 
 
 VIEW_SECTORS: Final = 180

@@ -12,12 +12,16 @@ from fog_contracts.messages import Berth, HandOver, OutOfService, Reason, RobotG
 from fog_runtime import logs
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Audit
+from planner.stops import carried
 from planner.store import OutOfServiceError, StoredGoal
 from planner.tours.persistence import WHO, MissionPersistence
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from fog_contracts.handover import Standing
-    from fog_contracts.messages import Pose
+    from fog_contracts.messages import Pose, Stop, Tour
+    from planner.stops import Ride
 
 _log = logs.get("planner")
 
@@ -39,10 +43,19 @@ class RidePersistence(MissionPersistence):
 
     site = "none"
     """This floor."""
+    leg_to: Callable[[str, Stop, str], tuple[Stop, Ride | None] | str] = staticmethod(
+        lambda _robot, stop, _who: (stop, None)
+    )
+    """Returns where a robot goes for a stop, for whom: there, or to the lift to its floor; or why it can't."""
 
     async def _load(self) -> None:
         self.berths = await self._store.berths()
         await super()._load()
+        left = {robot for robot, berth in self.berths.items() if berth.floor != self.site}
+        for robot, stored in (await self._store.goals()).items() if left else ():
+            if robot in left:  # it took its mission along, which could not be deleted any more
+                with self._uncertain_write():
+                    await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), WHO, "left"))
 
     def stand_by(self) -> None:
         """Forget it: another planner changes it until this one leads again."""
@@ -99,8 +112,10 @@ class RidePersistence(MissionPersistence):
         """Send a robot that waits for its lift into the cabin. Raises `StoreError`."""
         assert stored.ride is not None
         stamp = self._clock.stamp()
-        goal = RobotGoal(goal_id=secrets.token_hex(8), pose=cabin, stamp=stamp)
-        leg = StoredGoal(goal=goal, ride=structs.replace(stored.ride, boards=True))
+        tour = None if stored.tour is None else structs.replace(stored.tour, leg=stored.tour.leg + 1)
+        goal_id = secrets.token_hex(8) if tour is None else tour.goal_id
+        goal = RobotGoal(goal_id=goal_id, pose=cabin, stamp=stamp)
+        leg = StoredGoal(goal=goal, tour=tour, ride=structs.replace(stored.ride, boards=True))
         async with self._lock:
             if self.goals.get(robot) is not stored:
                 return
@@ -110,6 +125,16 @@ class RidePersistence(MissionPersistence):
                 self._begin(robot, leg)
             else:
                 self._reload = True
+
+    async def _replace(  # noqa: PLR0913  # as the base class
+        self, robot: str, stored: StoredGoal, stop: Stop, tour: Tour, *, who: str, action: str, ride: Ride | None = None
+    ) -> None:
+        found = self.leg_to(robot, stop, tour.who)
+        if isinstance(found, str):
+            await self.give_up(robot, stored, "cut", found)
+            return
+        stop, ride = found
+        await super()._replace(robot, stored, stop, tour, who=who, action=action, ride=ride)
 
     async def leave(self, robot: str, stored: StoredGoal) -> None:
         """Record that a robot has left this floor, and end its mission here, which it takes along.
@@ -122,6 +147,7 @@ class RidePersistence(MissionPersistence):
         given = HandOver(
             origin=self.site, floor=ride.floor, epoch=before.epoch + 1, lift=ride.lift, goal=ride.goal, who=ride.who,
             id=secrets.token_hex(8),
+            mission=None if stored.tour is None else carried(stored.tour, self.site, ride.floor),
         )  # fmt: skip
         after = next_berth(before, given)
         async with self._lock:

@@ -6,11 +6,12 @@ import math
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from fog_contracts.messages import Berth, LiftRequest
+from planner.problems import PlannerProblem
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from fog_contracts.messages import LiftState, Pose, RobotPose
+    from fog_contracts.messages import LiftState, Pose, RobotPose, RobotState
     from fog_contracts.site import LiftSite
     from planner.stops import Ride
 
@@ -89,6 +90,21 @@ def request(  # noqa: PLR0911  # each part of a ride has its own answer
 
 def _call(name: str, floor: str) -> LiftRequest:
     return LiftRequest(session_id=name, request_type="AGV_MODE", destination_floor=floor)
+
+
+def cannot_leave(robot: str, state: RobotState, floor: str, *, mission: bool) -> tuple[PlannerProblem, str] | None:
+    """Return why a robot can't be handed over to a floor, with a mission or without; None if it can.
+
+    Once its floor has recorded that it has left, there is no way back: a robot of before does not even recognize a
+    hand-over with a mission, since its signature counts what that robot does not know.
+    """
+    if floor not in state.floors:
+        known = ", ".join(state.floors) or "this floor only"
+        return PlannerProblem.FLOOR_UNKNOWN, f"robot {robot} does not know {floor}; it knows: {known}"
+    if mission and not state.carries_missions:
+        why = f"robot {robot} can't take a mission along to {floor}: bring its software to this version"
+        return PlannerProblem.ROBOT_OUTDATED, why
+    return None
 
 
 def lift_to(lifts: Iterable[LiftSite], floor: str, pose: RobotPose | None) -> LiftSite | None:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Protocol
 
+from msgspec import structs
+
 from fog_contracts import channels as ch
-from fog_contracts.messages import Berth, LiftState, Pose, Refusal
+from fog_contracts.messages import Berth, LiftState, Pose, Refusal, Stop
 from fog_runtime import logs
 from fog_runtime.clock import ticker
+from fog_runtime.http import ProblemError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
 from planner.lifts.persistence import on_behalf
-from planner.lifts.rides import Facts, cabins_at, inside_of, next_act, request, session
+from planner.lifts.rides import Facts, cabins_at, cannot_leave, inside_of, lift_to, next_act, request, session
+from planner.problems import PlannerProblem
 from planner.robot_operator import CommandError
-from planner.stops import Order
+from planner.stops import Order, Ride
 from planner.store import NO_MISSION, MissionConflictError, OutOfServiceError
 
 if TYPE_CHECKING:
@@ -70,6 +74,7 @@ class Riding:
         self._heard: dict[str, float] = {}
         self._created = clock.now()
         service.missions.site = site.id
+        service.missions.leg_to = self.leg_to
 
     def subscribe(self) -> None:
         """Follow the lifts of the site, if it has any."""
@@ -83,6 +88,55 @@ class Riding:
         """Note on which floor a robot is by its own record; one without a record knows this floor only."""
         self._heard[robot] = self._clock.now()
         self._service.missions.said[robot] = state.berth or Berth(floor=self._site.id)
+
+    def leg_to(self, robot: str, stop: Stop, who: str) -> tuple[Stop, Ride | None] | str:
+        """Return where a robot goes for a stop: there, or to the nearest lift to its floor; or why it can't."""
+        if stop.floor in (None, self._site.id):
+            found = self._resolved(stop)
+            return found if isinstance(found, str) else (found, None)
+        lift = lift_to(self._site.lifts, stop.floor, self._service.poses.get(robot))
+        if lift is None:
+            known = sorted({floor for each in self._site.lifts for floor in each.floors} - {self._site.id})
+            return f"no lift of {self._site.id} leads to {stop.floor}; lifts lead to: {', '.join(known) or 'no floor'}"
+        goal = stop.goal if stop.place is not None or stop.pose is not None else None
+        return Stop(pose=lift.wait), Ride(lift=lift.id, floor=stop.floor, goal=goal, who=who)
+
+    @property
+    def floor(self) -> str:
+        """This floor, by its site's id."""
+        return self._site.id
+
+    def first_leg(self, robot: str, stop: Stop, who: str, field: str) -> tuple[Stop, Ride | None]:
+        """Return where a robot goes for an ordered stop, which has its pose if it is here; `field`: where it stands.
+
+        Raises a `ProblemError` if no lift leads to its floor.
+        """
+        found = self.leg_to(robot, stop, who)
+        if isinstance(found, str):
+            raise ProblemError(PlannerProblem.NO_LIFT, found, field=f"{field}.floor")
+        return found
+
+    def check(self, robot: str, stop: Stop, field: str, *, mission: bool) -> None:
+        """Raise a `ProblemError` for an ordered stop on a floor to which the robot can't be handed over.
+
+        `mission`: with one. Raises `CommandError` if the robot is not heard.
+        """
+        if stop.floor is None:
+            return
+        state = self._service.operator.fresh_state(robot)
+        if (found := cannot_leave(robot, state, stop.floor, mission=mission)) is not None:
+            raise ProblemError(found[0], found[1], field=f"{field}.floor")
+
+    def _resolved(self, stop: Stop) -> Stop | str:
+        """Return a stop of this floor with a pose; or, for a place that does not exist, that there is none."""
+        if stop.pose is not None:
+            return stop
+        known = self._site.places if self._service.places is None else self._service.places
+        place = known.get(stop.place or "")
+        if place is None:
+            return f"there is no place {stop.place}"
+        pose = Pose(x=place.x, y=place.y, theta=place.theta or 0.0)
+        return structs.replace(stop, pose=pose, any_heading=place.theta is None)
 
     async def run(self) -> None:
         """Let rides go on, twice a second."""
@@ -135,13 +189,24 @@ class Riding:
             case "here" if known is not None and known.came_by is not None:
                 await self._take(robot, known.came_by)
             case "here" if (stored := missions.goals.get(robot)) is not None and stored.ride is not None:
-                ride = stored.ride
-                act = next_act(robot, self._facts(robot), self._lift(ride.lift), self._site.id)
-                if act == "leave":
-                    await missions.leave(robot, stored)
-                elif act == "board":
-                    cabin = next(lift.cabin for lift in self._site.lifts if lift.id == ride.lift)
-                    await missions.board(robot, stored, cabin)
+                await self._ride(robot, stored, stored.ride)
+
+    async def _ride(self, robot: str, stored: StoredGoal, ride: Ride) -> None:
+        """Send a robot into its lift, or hand it over in there, unless it can't be handed over: then its mission ends.
+
+        It could be when it was ordered there, but may have been started with other software or settings since.
+        """
+        missions, state = self._service.missions, self._service.operator.heard(robot)
+        act = next_act(robot, self._facts(robot), self._lift(ride.lift), self._site.id)
+        if act == "wait" or state is None:
+            return
+        if (found := cannot_leave(robot, state, ride.floor, mission=stored.tour is not None)) is not None:
+            await missions.give_up(robot, stored, "cut", found[1])
+        elif act == "leave":
+            await missions.leave(robot, stored)
+        else:
+            cabin = next(lift.cabin for lift in self._site.lifts if lift.id == ride.lift)
+            await missions.board(robot, stored, cabin)
 
     async def _take(self, robot: str, given: HandOver) -> None:
         """Give a robot that has come its goal once its lift is here and open; settle once it has left the cabin."""
@@ -167,24 +232,21 @@ class Riding:
             begun.discard(name)
 
     async def _send(self, robot: str, given: HandOver, goal: FloorGoal) -> None:
-        pose, any_heading = goal.pose, goal.any_heading
-        if goal.place is not None:
-            known = self._site.places if self._service.places is None else self._service.places
-            if (place := known.get(goal.place)) is None:
-                _log.warning("ride_without_goal", robot=robot, reason=f"there is no place {goal.place}")
-                return
-            pose, any_heading = Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
-        if pose is None:
+        stop = self._resolved(Stop(place=goal.place, pose=goal.pose, any_heading=goal.any_heading))
+        if isinstance(stop, str):
+            _log.warning("ride_without_goal", robot=robot, reason=stop)
             return
+        assert stop.pose is not None  # it is resolved
         attempt = Attempt.of("floors", given.id or session(robot, given.epoch), "arrival", given)
         order = Order(
             robot,
-            pose,
+            stop.pose,
             on_behalf(robot, given),
-            place=goal.place,
-            any_heading=any_heading,
+            place=stop.place,
+            any_heading=stop.any_heading,
             attempt=attempt,
             expected=NO_MISSION,
+            tour=given.mission,
         )
         try:
             sent = await self._service.send(order)

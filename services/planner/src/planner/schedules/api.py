@@ -27,7 +27,7 @@ from fog_runtime.stores.redis_store import ANY
 from planner.problems import PlannerProblem
 from planner.schedules.occasions import SCHEDULES_MAX
 from planner.stops import MissionBody, ScheduledMission
-from planner.tours.api import check_best, goal_pose
+from planner.tours.api import check_best, stop_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -106,7 +106,7 @@ class _Schedules:
             raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="path") from None
         self._check_robot(body.robot)
         for number, stop in enumerate(body.mission.stops):
-            goal_pose(stop, places(), f"body.mission.stops.{number}")
+            stop_of(stop, places(), self._service.missions.site, f"body.mission.stops.{number}")
         if not is_time_zone(zone := body.weekly.time_zone):
             detail = f"{zone!r} is no time zone that this machine knows: name one such as Europe/Lisbon"
             raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.weekly.time_zone")
@@ -114,7 +114,7 @@ class _Schedules:
         if window is not None and not window.is_one:
             detail = "the windows leave no gap in a week, so that none ever begins: let a minute pass between two"
             raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body.weekly.times")
-        check_best(body.mission, "body.mission")
+        check_best(body.mission, self._service.missions.site, "body.mission")
         if name not in self.known and len(self.known) >= SCHEDULES_MAX:
             detail = f"there are {SCHEDULES_MAX} schedules already, which is the limit: delete one that is not needed"
             raise ProblemError(HttpProblem.REQUEST_INVALID, detail, field="body")

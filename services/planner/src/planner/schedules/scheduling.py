@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Place, PlanReply, PlanRequest, RobotPose, RobotState
     from fog_contracts.site import Site
     from fog_runtime.clock import Clock
+    from planner.lifts.riding import Riding
     from planner.robot_operator import RobotOperator
     from planner.schedules.persistence import SchedulePersistence
     from planner.stops import ScheduledMission
@@ -60,7 +61,8 @@ _log = logs.get("planner")
 _NO_REASON: Final = Reason("", "")
 _PLANNER_AWAY: Final = Reason(ScheduleCode.PLANNER_AWAY, "the planner did not run, or its clock was not set")
 _CODES: Final[Sequence[tuple[type[Exception], str]]] = (
-    (BusyError, PlannerProblem.BUSY), (MissionConflictError, PlannerProblem.MISSION_CHANGED),
+    (BusyError, PlannerProblem.BUSY), (CommandError, PlannerProblem.COMMAND_LOST),
+    (MissionConflictError, PlannerProblem.MISSION_CHANGED),
     (OutOfServiceError, PlannerProblem.OUT_OF_SERVICE), (StoreError, HttpProblem.STORE_AWAY),
 )  # fmt: skip
 
@@ -78,6 +80,7 @@ class Robots(Protocol):
     operator: RobotOperator
     visiting: Visiting
     poses: dict[str, RobotPose]
+    riding: Riding
 
     @property
     def places(self) -> Mapping[str, Place] | None:
@@ -201,7 +204,14 @@ class Scheduling:
         self._tried[schedule.version] = self._clock.now()
         try:
             given = await self._order(schedule, window)
-        except (BusyError, IdempotencyError, MissionConflictError, OutOfServiceError, ProblemError) as error:
+        except (
+            BusyError,
+            CommandError,
+            IdempotencyError,
+            MissionConflictError,
+            OutOfServiceError,
+            ProblemError,
+        ) as error:
             self._why[schedule.version] = _reason(error)
             return
         except StoreError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 from collections import defaultdict
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from typing import Literal
 
-    from fog_contracts.messages import Berth, OutOfService, RobotPath
+    from fog_contracts.messages import Berth, OutOfService, RobotPath, Stop, Tour
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.stores.redis_store import Attempt, StoreStatus
     from planner.core import PlannerCore
-    from planner.stops import Order, ScheduledMission, Stop, Tour
+    from planner.stops import Order, Ride, ScheduledMission
     from planner.store import Store
 
 STORE_PERIOD_S = 0.5
@@ -143,8 +143,8 @@ class MissionPersistence:
             )
             await self._store_mission(order, stored, Audit(stamp, order.who, order.action, order.attempt))
             self._begin(order.robot, stored)
-        if stored.tour is not None and stored.tour.deadline is not None:
-            self._ends.count(stored.tour.id, stored.tour.deadline)
+        if (tour := stored.tour) and tour.deadline is not None and not tour.leg:  # else by another floor's clock
+            self._ends.count(tour.id, tour.deadline)
         _log.info("goal_accepted", robot=order.robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=order.who)
         return stored
 
@@ -293,11 +293,13 @@ class MissionPersistence:
                 if stored.tour is not None:
                     await self._apply(robot, stored, stored.tour)
 
-    async def _replace(self, robot: str, stored: StoredGoal, stop: Stop, tour: Tour, *, who: str, action: str) -> None:
+    async def _replace(  # noqa: PLR0913  # the parts of a leg, and who stores it
+        self, robot: str, stored: StoredGoal, stop: Stop, tour: Tour, *, who: str, action: str, ride: Ride | None = None
+    ) -> None:
         """Store the next leg of a mission if the robot still has the one before, then begin it. Raises `StoreError`."""
         stamp = self._clock.stamp()
         goal = RobotGoal(goal_id=tour.goal_id, pose=stop.pose, place=stop.place, stamp=stamp)
-        leg = StoredGoal(goal=goal, any_heading=stop.any_heading, tour=tour)
+        leg = StoredGoal(goal=goal, any_heading=stop.any_heading, tour=tour, ride=ride)
         async with self._lock:
             if self.goals.get(robot) is not stored:
                 return
@@ -311,7 +313,7 @@ class MissionPersistence:
     async def _apply(self, robot: str, stored: StoredGoal, tour: Tour) -> None:
         """End a mission whose deadline has passed, and do what it says about a way that is cut."""
         if self._ends.passed(tour.id, tour.deadline):
-            await self._give_up(robot, stored, "deadline", "its deadline has passed")
+            await self.give_up(robot, stored, "deadline", "its deadline has passed")
             return
         path = self._path(robot)
         if path is None or path.goal_id != stored.goal.goal_id:
@@ -321,18 +323,17 @@ class MissionPersistence:
             kind, nearest, reason = path.refusal.kind, path.refusal.nearest, path.refusal.reason
         act = act_on_cut(tour, nearest, *self._cut[robot].see(tour, kind, self._clock.now()))
         if act == "cancel":
-            await self._give_up(robot, stored, "cut", reason or "no way has led to its stop for too long")
+            await self.give_up(robot, stored, "cut", reason or "no way has led to its stop for too long")
         elif act == "on":
             await self._replace(robot, stored, *next_leg(tour, stored.stop), who=WHO, action="stop")
-        elif act == "nearest" and nearest is not None:
+        elif act == "nearest" and nearest is not None and stored.ride is None:  # a lift is no stop
             await self._replace(robot, stored, *leg_aside(tour, stored.stop, nearest), who=WHO, action="aside")
 
-    async def _give_up(self, robot: str, stored: StoredGoal, action: str, why: str) -> None:
-        try:
+    async def give_up(self, robot: str, stored: StoredGoal, action: str, why: str) -> None:
+        """End a mission that can't go on, unless an operator was faster; `why` is logged. Raises `StoreError`."""
+        with suppress(MissionConflictError):
             await self.cancel(robot, WHO, stored.goal.goal_id, action=action)
-        except MissionConflictError:
-            return  # an operator was faster
-        _log.warning("mission_given_up", robot=robot, goal=stored.goal.goal_id, action=action, reason=why)
+            _log.warning("mission_given_up", robot=robot, goal=stored.goal.goal_id, action=action, reason=why)
 
     @contextmanager
     def _uncertain_write(self) -> Iterator[None]:

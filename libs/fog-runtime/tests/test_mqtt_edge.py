@@ -385,6 +385,24 @@ class VanishingBroker:
         with contextlib.suppress(asyncio.CancelledError):  # as asyncio.wait_for does when its wait has just ended
             await asyncio.Event().wait()
 
+    unsubscribe = publish
+
+    async def subscribe(self, topics):
+        await self.publish()
+        return [1] * len(topics)
+
+
+async def test_cancellation_ends_a_connection_that_is_being_made(broker):
+    edge = make_edge(broker, "n1")
+    edge._brokers[0] = VanishingBroker()
+    edge.on(ch.NODE_READING, lambda *_: None, m.NodeReading)
+    running = asyncio.create_task(edge.run())
+    for _ in range(3):  # until it waits for the answer to its subscription
+        await asyncio.sleep(0)
+    running.cancel()
+    done, _ = await asyncio.wait([running], timeout=5)
+    assert (done, running.cancelled()) == ({running}, True)
+
 
 async def test_cancellation_ends_a_connection_that_is_lost_meanwhile(broker):
     edge, vanishing = make_edge(broker, "n1"), VanishingBroker()
@@ -393,8 +411,9 @@ async def test_cancellation_ends_a_connection_that_is_lost_meanwhile(broker):
     async with asyncio.timeout(60):
         await edge.wait_connected()
         publishing = asyncio.create_task(edge.publish(ch.NODE_READING, reading(1), node="n1"))
+        asking = asyncio.create_task(edge.broker_answers())
         await asyncio.sleep(0)
-        for task in (publishing, running):
+        for task in (asking, publishing, running):
             task.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await task

@@ -43,15 +43,20 @@ def test_signal_cancels_main_and_exits_with_status_zero(number):
     assert [json.loads(line)["event"] for line in err.splitlines()] == ["stopping", "stopped"]
 
 
-def test_process_that_does_not_end_after_a_signal_shows_where_it_hangs_and_exits_with_status_one():
-    program = PROGRAM.format(body="pass", seconds=60.0).replace(
+@pytest.mark.parametrize("ends_itself", [False, True])
+def test_process_that_does_not_end_when_it_is_to_shows_where_it_hangs_and_exits_with_status_one(tmp_path, ends_itself):
+    folder = f"Path({str(tmp_path)!r})"
+    changes = f"maps = UploadedMaps({folder}); ({folder} / FILE).write_text('another'); await maps.until_changed()"
+    program = "from pathlib import Path\nfrom fog_runtime.configuration.uploaded_maps import FILE, UploadedMaps\n"
+    program += PROGRAM.format(body=changes if ends_itself else "pass", seconds=0.0 if ends_itself else 60.0).replace(
         'print("cleaned", flush=True)', "await asyncio.Event().wait()"
     )
     command = [sys.executable, "-c", program.replace("process.run(main)", "process.ENDING_S = 0.3; process.run(main)")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
         assert child.stdout.readline() == "up\n"
-        child.send_signal(signal.SIGTERM)
-        _, err = child.communicate(timeout=60)
+        if not ends_itself:
+            child.send_signal(signal.SIGTERM)
+        _, err = child.communicate(timeout=20)
     assert child.returncode == 1
     assert "Timeout (0:00:00.300000)!" in err
     assert "_run_once" in err

@@ -102,13 +102,22 @@ def _unchanged_parts(smaps: str) -> list[tuple[int, int]]:
 
 
 class AgainError(Exception):
-    """The process ends in order to be started again by what supervises it, with what it reads at its start only."""
+    """The process ends in order to be started again by what supervises it, with what it reads at its start only.
+
+    Call `limit_the_end` before it is raised: as after a signal, an end that hangs is cut short.
+    """
 
 
 ENDING_S: Final = 9.0
 """How long an orderly end may take: less than container engines and service managers wait before they kill."""
 
 T = TypeVar("T")
+
+
+def limit_the_end() -> None:
+    """Cut this process's end short if it is not over in `ENDING_S`: show where it hangs, and exit with status 1."""
+    faulthandler.dump_traceback_later(ENDING_S, exit=True)
+
 
 _loading: Final[set[threading.Thread]] = set()
 
@@ -157,7 +166,7 @@ async def _supervise(main: Callable[[], Awaitable[None]]) -> None:
             os._exit(1)
         stopping = True
         _log.info("stopping", signal=signal.Signals(number).name)
-        faulthandler.dump_traceback_later(ENDING_S, exit=True)
+        limit_the_end()
         task.cancel()
 
     numbers = tuple(machine.ending())

@@ -17,7 +17,7 @@ from fog_contracts.messages import Message
 from fog_runtime import logs
 from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_runtime.files import SHARED, atomic_write
-from fog_runtime.process import AgainError
+from fog_runtime.process import AgainError, limit_the_end
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -108,6 +108,7 @@ class UploadedMaps:
             await asyncio.sleep(PERIOD_S)
         if before is not None:
             await before()
+        limit_the_end()
         raise AgainError("another map is in force")
 
     def _state(self) -> bytes:

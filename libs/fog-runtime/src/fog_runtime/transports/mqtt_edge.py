@@ -71,10 +71,12 @@ async def _receive_retained(client: aiomqtt.Client, inbox: Inbox) -> None:
     while received != inbox.retained:
         received = inbox.retained
         await client.unsubscribe(NOT_SUBSCRIBED)
+        raise_if_cancelled()
 
 
 async def _subscribe(client: aiomqtt.Client, qos_by_topic: Mapping[str, int]) -> None:
     codes = await client.subscribe(list(qos_by_topic.items()))
+    raise_if_cancelled()
     for topic, code in zip(qos_by_topic, codes, strict=True):
         if isinstance(code, ReasonCode) and code.is_failure:
             _log.error("subscription_refused", topic=topic, reason=str(code))
@@ -135,6 +137,7 @@ class MqttEdge:
         except aiomqtt.MqttError:
             raise_if_cancelled()
             return False
+        raise_if_cancelled()
         return client is self._client
 
     @property

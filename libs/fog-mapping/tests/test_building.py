@@ -16,7 +16,7 @@ from fog_mapping.loops import LoopSearch, _neighbours
 from fog_mapping.poses import Edge, between, compose, place
 from fog_mapping.relations import absolute_error, relation_errors, scans_fit
 from fog_mapping.scans import Scan, keep_moved, scan_of
-from fog_mapping.trajectory import _AROUND, _Cells, refuse_mirrored
+from fog_mapping.trajectory import _AROUND, _Cells, match_in_order, refuse_mirrored
 
 CELL = 0.05
 BEAMS = np.radians(np.arange(240) * 1.5 - 180.0)
@@ -229,6 +229,13 @@ def test_corridor_without_features_is_neither_folded_nor_shortened():
     assert absolute_error(found.poses, truth) < 0.5
     # Nothing along it tells how long it is: odometry says so, which is 5 % long.
     assert 0.98 < np.ptp(found.poses[:, 0]) / np.ptp(truth[:, 0]) < 1.06
+
+
+def test_a_step_along_a_corridor_is_certain_across_and_not_along_however_the_first_scan_lay():
+    scans, _ = Building([(1, 1, 31, 3)], []).drive([(12, 1.4), (12, 2.0), (19, 2.0)], seed=3)
+    _, edges = match_in_order(scans)
+    along, across = np.array([(edge.information[0, 0], edge.information[1, 1]) for edge in edges[-25:]]).T
+    assert (across > 10.0 * along).all()
 
 
 def test_lidar_on_its_head_is_noticed_and_one_that_stands_right_is_not():

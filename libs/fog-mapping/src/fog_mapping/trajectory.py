@@ -68,6 +68,14 @@ def independent(information: NDArray[np.float64]) -> NDArray[np.float64]:
     return kept
 
 
+def _turned(information: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
+    """Return the same information (3, 3) in axes that are turned by `turn` (rad)."""
+    axes = np.eye(3)
+    axes[:2, :2] = ((math.cos(turn), -math.sin(turn)), (math.sin(turn), math.cos(turn)))
+    kept: NDArray[np.float64] = axes.T @ information @ axes
+    return kept
+
+
 def match_in_order(
     scans: Sequence[Scan], on_progress: Callable[[int], None] = lambda _: None
 ) -> tuple[NDArray[np.float64], list[Edge]]:
@@ -87,7 +95,10 @@ def match_in_order(
 def match_next(
     scans: Sequence[Scan], poses: NDArray[np.float64], i: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the pose (3,) of scan `i` by those before it, whose poses (n, 3) are known, and its information (3, 3)."""
+    """Return the pose (3,) of scan `i` by those before it, whose poses (n, 3) are known.
+
+    And its information (3, 3), along and across as the scan before it looks.
+    """
     step = between(scans[i - 1].odometry, scans[i].odometry)
     guess = compose(poses[i - 1], step)
     near = [j for j in range(max(0, i - WINDOW), i) if math.hypot(*(poses[j] - guess)[:2]) < _SPREAD_M]
@@ -111,7 +122,7 @@ def match_next(
     start = tuple(guess) if found is None else found.pose
     aligned = before.align(scans[i].points, scans[i].normals, start, tuple(guess), prior, GATES)
     # A scan from after a break may be of another place that looks alike: only a loop tells.
-    told = np.zeros((3, 3)) if broken else independent(aligned.information)
+    told = np.zeros((3, 3)) if broken else _turned(independent(aligned.information), float(poses[i - 1, 2]))
     return np.array(aligned.pose), told + _ODOMETRY_SHARE * prior
 
 

@@ -99,7 +99,7 @@ class NodeFolder(SystemFolder):
             except BlockingIOError:
                 raise FailedError(
                     f"a fog node already runs with the data in {self.path}: end it first (fognav down), "
-                    "or name another folder with --data"
+                    "or name another folder"
                 ) from None
             yield
 

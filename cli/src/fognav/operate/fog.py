@@ -174,9 +174,8 @@ class Fog:
 def _in_commands(text: str) -> str:
     """Return what a problem document says, in the words of the command."""
     named = re.sub(r"GET /api/v1/([a-z-]+(?:/[a-z.]+)*)", lambda found: _IN_COMMANDS.get(found[1], found[0]), text)
-    return re.sub(
-        r"`(?:detail|errors)` names", "it names", re.sub(r", or (?:POST|PUT) a new one", ", or add one", named)
-    )
+    added = re.sub(r"[:;] PUT one first", "", re.sub(r", or (?:POST|PUT) a new one", ", or add one", named))
+    return re.sub(r"`(?:detail|errors)` names", "it names", added)
 
 
 def find_fog(address: str | None) -> Fog:

@@ -392,7 +392,8 @@ def test_zones_are_listed_shown_and_removed(demo: Service) -> None:
 
 def test_refusal_gives_reason_and_remedy_of_the_problem_document(demo: Service) -> None:
     remedy = "Choose one of GET /api/v1/zones, or POST a new one"
-    demo.answers["GET", "/api/v1/zones/nix"] = (404, {"detail": "there is no zone nix: PUT one first", "remedy": remedy})
+    problem = {"detail": "there is no zone nix: PUT one first", "remedy": remedy}
+    demo.answers["GET", "/api/v1/zones/nix"] = (404, problem)
     said = "there is no zone nix. Choose one of `fognav zone list`, or add one"  # a command, and not a route
     assert f"the map-service refused it: {said}" in run("zone", "show", "nix", code=1)
     demo.answers["DELETE", "/api/v1/zones/z-1"] = (401, {"detail": "the token is unknown"})

@@ -367,7 +367,8 @@ class BoardOptions:
             print_line(f"wrote {self.target}, and what reads it: esphome run {self.out / _ESPHOME.name}")
         else:
             print_line(f"wrote {self.target}: flash it (firmware/README.md), then: fognav node calibrate {node.id}")
-        print_line("the hazard-aggregator reads the site at its start: restart it")
+        if verb == "added":
+            print_line("the hazard-aggregator reads the site at its start: restart it")
 
 
 def _asked(what: str, option: str, *, hidden: bool = False) -> str:

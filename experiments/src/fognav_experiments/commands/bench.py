@@ -129,8 +129,8 @@ def floors_command(
 
     Robots and nodes are played by one process a floor, which does not count. Memory (MB) and processor time (% of a
     core) are those of all floors together, by program; the model is the line through the least and the largest count.
-    With --stops two floors have a whole simulated robot each, which drive; a time runs from the request to the
-    console-service of one floor until the wheels of both robots stand.
+    With --stops two floors have a whole simulated robot each, which drive; times run from the request to
+    the console-service of one floor until the bases of both robots are told to stand, and until both do.
     """
     from fognav_experiments.bench import floors  # noqa: PLC0415  # keeps the other commands fast
 

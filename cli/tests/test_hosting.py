@@ -138,6 +138,17 @@ def node(tmp_path: Path) -> LocalNode:
     return LocalNode(NodeConfig(folder=folder, sites=sites, security=security, address="127.0.0.2"), lambda _: None)
 
 
+def test_services_get_what_their_operator_sets_and_no_other_setting_of_the_shell(tmp_path, monkeypatch):
+    monkeypatch.setenv("FOGNAV_WALL_CLOCK", "trusted")
+    monkeypatch.setenv("FOGNAV_SPEED", "7")
+    folder = NodeFolder(tmp_path / "data")
+    sites, security = hosted_sites([ESTIG], folder.security, ["localhost"])
+    made = LocalNode(NodeConfig(folder=folder, sites=sites, security=security, address="127.0.0.2"), lambda _: None)
+    for service in ("map-service", "planner"):
+        environment = made.supervisor._get(service).program.environment
+        assert (environment["FOGNAV_WALL_CLOCK"], "FOGNAV_SPEED" in environment) == ("trusted", False)
+
+
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
 def test_systemd_accepts_the_unit(tmp_path, monkeypatch):
     monkeypatch.setenv("FOGNAV_MAP_PORT", "8102")

@@ -185,6 +185,14 @@ def inherited_environment() -> dict[str, str]:
     return {**inherited, "PYTHONUNBUFFERED": "1", "PYTHONDONTWRITEBYTECODE": ""}
 
 
+_OF_OPERATORS: Final = ("TIME_IN_COST", "WAIT", "WALL_CLOCK")
+
+
+def operators_settings() -> dict[str, str]:
+    """Return what whoever starts a fog node sets for its services (docs/operator.md), without the prefix FOGNAV_."""
+    return {name: value for name in _OF_OPERATORS if (value := os.environ.get(f"FOGNAV_{name}"))}
+
+
 def simulated_robot_settings(folder: Path, robot: str, hardware: Mapping[str, str]) -> dict[str, str]:
     """Return the settings of a robot's programs whose devices a simulator makes in `folder`/sim."""
     return {

@@ -52,6 +52,7 @@ from fognav.programs import (
     Ready,
     ServerPorts,
     exists,
+    operators_settings,
     server_programs,
     simulated_robot_settings,
     simulator_settings,
@@ -158,6 +159,7 @@ class LocalNode:
             "MQTT_URL": self._urls[BROKER],
             "REDIS_URL": self._urls[REDIS],
             "ZENOH_CONNECT": self._urls[ROUTER],
+            **operators_settings(),
         }
         self._programs = ProgramSet(self.supervisor, config.folder, common)
         for program in self.server_set:

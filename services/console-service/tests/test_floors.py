@@ -135,7 +135,8 @@ async def test_one_press_stops_the_robots_of_both_floors_and_each_floor_says_so(
                 await asyncio.sleep(0.1)
         answer = await floors.client.post("/api/v1/floors/stop", json={})
         assert answer.status_code == 200, answer.text
-        assert [(each["id"], each["acknowledged"]) for each in answer.json()] == [("test", True), ("upstairs", True)]
+        told = [(each["id"], each["acknowledged"], each["detail"]) for each in answer.json()]
+        assert told == [("test", True, ""), ("upstairs", True, "")]
         assert (here.stopped_by, there.stopped_by) == (["vera"], ["floor test/vera"])
         await listed(floors, lambda entry: entry["floor"]["stopped"])
         answer = await floors.client.post("/api/v1/floors/stop", json={"floors": ["cellar"]})

@@ -23,7 +23,21 @@ from fog_contracts.channels import (
     THESIS_WSN,
 )
 from fog_contracts.codec import encode
-from fog_contracts.messages import VIEW_SECTORS, RobotObstacles, RobotPath, RobotRelease, UnknownPolicy, View
+from fog_contracts.commands import signed_command
+from fog_contracts.messages import (
+    STOPS_MAX,
+    VIEW_SECTORS,
+    FloorGoal,
+    HandOver,
+    Pose,
+    RobotObstacles,
+    RobotPath,
+    RobotRelease,
+    Stop,
+    Tour,
+    UnknownPolicy,
+    View,
+)
 
 ids = st.from_regex(r"[a-z0-9][a-z0-9-]{0,31}", fullmatch=True)
 numbers = st.from_regex(r"[0-9]{1,4}", fullmatch=True)
@@ -139,6 +153,22 @@ def test_a_release_is_below_120_bytes_with_the_largest_numbers() -> None:
     )  # fmt: skip
     assert len(encode(ch.ROBOT_RELEASE, release)) < 120
     assert len(encode(ch.ROBOT_RELEASE, msgspec.structs.replace(release, plan_id=LARGEST))) <= ch.ROBOT_RELEASE.limit
+
+
+def test_a_robot_can_be_handed_over_with_the_longest_mission() -> None:
+    longest = Stop(pose=Pose(x=1 / 3, y=2 / 3, theta=0.3), place="p" * 32, floor="f" * 32)
+    tour = Tour(
+        id="t" * 16, leg=99, reached=(longest,) * (STOPS_MAX - 1), ahead=(longest,), who="w" * 100, deadline=1e9 / 3
+    )
+    given = HandOver(
+        origin="o" * 32, floor="f" * 32, epoch=LARGEST, lift="l" * 32, goal=FloorGoal(place="p" * 32), who="w" * 100,
+        id="i" * 16, mission=tour,
+    )  # fmt: skip
+    command = signed_command(
+        "hand_over", robot="r" * 32, operator="w" * 100, nonce="n" * 32, boot="b" * 16, issued_at=1e9 / 3,
+        key=b"k" * 32, given=given,
+    )  # fmt: skip
+    assert len(encode(ch.ROBOT_COMMAND, command)) > 1024
 
 
 PATH = RobotPath(

@@ -266,6 +266,22 @@ async def test_every_stop_is_reached_once_in_order_whatever_is_lost_or_started_a
         assert (await building.stored(), building.lift.session) == ([], "")
 
 
+async def test_lift_keeps_a_robot_that_has_come_until_its_floor_can_take_it_in(
+    building: Building, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def away(*_: object) -> None:
+        raise StoreError("no store")
+
+    await building.floors["ground"].order(UP)
+    with monkeypatch.context() as patched:
+        patched.setattr(building.floors["upstairs"].missions, "arrive", away)
+        await building.go_on(until=lambda: building.berth.floor == "upstairs")
+        await building.go_on(20)
+        assert building.lift.session != ""
+    await building.go_on()
+    assert (building.stops, building.lift.session) == ([("upstairs", 4.0)], "")
+
+
 @pytest.mark.parametrize(("goals", "stuck"), [*((goals, False) for goals in range(1, 8)), (4, True)])
 async def test_mission_that_is_cancelled_ends_wherever_the_robot_is_then_and_does_not_come_back(
     building: Building, goals: int, *, stuck: bool

@@ -316,7 +316,7 @@ ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles"
     publishers=(ROBOT,),   subscribers=(MAP, CONSOLE, WEB, BRIDGE), durability=VOLATILE, rate_hz=1)
 ROBOT_VITALS      = _pub(  "robot_vitals",      FOG + "robots/{robot}/vitals",    m.RobotVitals,    limit=512,
     publishers=(ROBOT,),   subscribers=(WEB,), durability=VOLATILE, rate_hz=0.5, max_age_s=6)
-ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
+ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=8 * KIB,
     publishers=(ROBOT,),   subscribers=(PLANNER, CONSOLE), reply=m.CommandReply, reply_limit=2 * KIB)
 LIFT_STATE        = _pub(  "lift_state",        FOG + "lifts/{lift}/state",       m.LiftState,      limit=16 * KIB,
     publishers=(SIM,), subscribers=(PLANNER,), durability=VOLATILE, rate_hz=1, max_age_s=3)

@@ -23,7 +23,7 @@ from fog_runtime.clock import Phase, Ticker
 from fog_runtime.configuration.robot_file import describe_robot
 from fog_runtime.health import Health, reachable_address, serve_health
 from fog_runtime.machine import ServiceManager, SuspensionMonitor, run_in_real_time
-from fog_runtime.process import AgainError, release_startup_memory
+from fog_runtime.process import AgainError, limit_the_end, release_startup_memory
 from fog_runtime.transports.edges import Edges
 from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
 from fog_runtime.version import VERSION
@@ -189,6 +189,7 @@ class Service:
             _log.error("floor_not_stored", floor=berth.floor, reason=str(error), remedy="it is tried again")
             return
         self._core.leave()
+        limit_the_end()
         raise AgainError(f"the robot is on {berth.floor} now")
 
     async def _announce_metrics(self) -> None:

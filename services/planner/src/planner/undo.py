@@ -76,8 +76,8 @@ async def _undo(
     assert goal.pose is not None
     if before.tour is not None and before.tour.deadline is not None:
         require_rest(before.tour.deadline, service.stamp(), f"the mission of robot {robot}")
-    # A new id: the robot may have reached or cancelled a leg of the old one.
-    tour = None if before.tour is None else structs.replace(before.tour, id=secrets.token_hex(8))
+    # A new id: the robot may have reached or cancelled a leg of the old one. From leg 0 on its deadline is counted.
+    tour = None if before.tour is None else structs.replace(before.tour, id=secrets.token_hex(8), leg=0)
     order = Order(
         robot, goal.pose, who, place=goal.place, any_heading=before.any_heading, expected=expected, action=ACTION,
         tour=tour, idle=goal.idle,

@@ -153,8 +153,11 @@ class Riding:
                 await self._step(robot)
             except (StoreError, CommandError) as error:
                 _log.warning("ride_delayed", robot=robot, reason=str(error))
+        # What is only on its way here keeps its lift until it has been taken in: its stay here is not known before.
+        here = {robot for robot in missions.said if missions.standing(robot) == "here"}
+        here |= {*missions.berths, *missions.goals}
         for lift in self._site.lifts:
-            for robot in robots:
+            for robot in here:
                 state = self._lift(lift.id)
                 if (asked := request(lift.id, robot, self._facts(robot), state, self._site.id)) is not None:
                     self._zenoh.publish(ch.LIFT_REQUEST, asked, lift=lift.id)

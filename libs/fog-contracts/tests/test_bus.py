@@ -147,6 +147,6 @@ def test_published_channel_can_be_queried_for_its_latest_message(bus):
 
 
 def test_roundtrip_enforces_the_size_limit():
-    command = RobotCommand(kind="disable", robot="r1", operator="e" * 2000, nonce="n" * 16, issued_at=1.0)
+    command = RobotCommand(kind="disable", robot="r1", operator="e" * 9000, nonce="n" * 16, issued_at=1.0)
     with pytest.raises(ContractError, match="limit"):
         roundtrip(ch.ROBOT_COMMAND, command)

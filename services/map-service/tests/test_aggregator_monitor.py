@@ -379,6 +379,7 @@ STEPS = st.one_of(
 
 @given(st.lists(STEPS, max_size=40))
 @example([("change", "blocked"), ("beats", 4), ("foreign", "blocked", -1, 0)])
+@example([("change", "clear"), ("beats", 4), ("lose", "blocked"), ("silence", 1.0), ("beats", 2)])
 @settings(max_examples=200, deadline=None)
 def test_clear_area_is_one_that_the_aggregator_announced_as_clear_within_the_limit(steps):
     fog = Fog("hall")

@@ -7,6 +7,7 @@ the heartbeat lives; dangers need no confirmation. What the heartbeat lists and 
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
@@ -43,6 +44,7 @@ class AggregatorMonitor:
         self._reach = 0  # the highest epoch that an aggregator can have, as far as epochs were heard
         self._newest: _Sender | None = None  # the believed one, or one with a higher epoch that is not trusted yet
         self._missing: dict[str, float] = {}  # since when the map lacks what the heartbeat lists, by area
+        self._compared_at = math.inf
         self._digest_differs = False
         self._asked_at = -REQUEST_PERIOD_S
 
@@ -149,4 +151,8 @@ class AggregatorMonitor:
             missing.update(announced)
         missing.update(area for area in heartbeat.areas if area not in defined)
         missing.update(area for area in received if area not in heartbeat.areas)
-        self._missing = {area: self._missing.get(area, now) for area in missing}
+        # What the heartbeat before this one confirmed holds no longer than that one lived, however late this one came.
+        lived = self._compared_at + ch.AGGREGATOR_HEARTBEAT.max_age_s
+        since = min(now, lived - IN_FLIGHT_S) if now <= lived else now
+        self._missing = {area: self._missing.get(area, since) for area in missing}
+        self._compared_at = now

@@ -26,6 +26,7 @@ from planner.robot_operator import CommandError
 from planner.stops import GoalPose, MissionBody, StopBody
 from planner.store import Store
 from planner.tours.api import Conditions, mission_order
+from planner.undo import _undo
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
@@ -333,6 +334,24 @@ async def test_deadline_that_passes_in_the_lift_ends_the_mission_upstairs_once_t
     await building.go_on(4)
     assert (building.stops, await building.stored()) == ([("upstairs", 4.0)], [])
     assert (await upstairs.store.audit(limit=1)).entries[0].action == "deadline"
+
+
+async def test_mission_that_is_given_again_by_an_undo_ends_at_its_deadline_by_a_clock_that_nobody_sets(
+    building: Building,
+) -> None:
+    ground = building.floors["ground"]
+    ground.clock.ahead = 1e6
+    await ground.order(DOWN, stop("ground", 3.0), deadline_s=60.0)
+    await building.go_on(until=lambda: ("ground", 2.0) in building.stops)
+    building.stuck = True
+    await building.go_on(3)
+    stored = ground.missions.goals["r1"]
+    assert stored.tour is not None
+    assert stored.tour.leg > 0
+    await ground.missions.cancel("r1", "anna")
+    await _undo(cast("Any", ground), "r1", stored, None, "anna")
+    await building.go_on(150)
+    assert (await building.stored(), (await ground.store.audit(limit=1)).entries[0].action) == ([], "deadline")
 
 
 async def test_robot_that_can_take_no_mission_along_any_more_is_not_sent_into_the_lift(building: Building) -> None:

@@ -381,10 +381,19 @@ def test_an_area_is_named_by_its_label_unless_it_is_clear(state, description, ca
     assert found.containing(HERE, lethal(), ObstacleReporter(10.0, 3, 0.17), 0.0) == (
         description or "a blocked part of the map"
     )
-    assert found.only_watched(HERE)
-    assert not found.only_watched(Pose2(1.0, 1.0, 0.0))
+    assert found.only_watched(HERE, lethal())
+    assert not found.only_watched(Pose2(1.0, 1.0, 0.0), lethal())
     assert (found.caution(HERE) is not None) == caution
     assert found.caution(Pose2(1.0, 1.0, 0.0)) is None
+
+
+@pytest.mark.parametrize(("edge", "watched"), [(5.0, True), (4.9, False)])
+def test_cell_that_an_area_or_a_zone_only_touches_is_blocked_by_it(edge, watched):
+    shape = RectangleShape(corner=(4.0, 4.0), opposite=(edge, 6.0))
+    beside, zone = [(4.0, 4.0), (edge, 4.0), (edge, 6.0), (4.0, 6.0)], Zone(id="wet", kind="BLOCKED", shape=shape)
+    inside = Pose2(5.03, 5.03, 0.0)
+    assert places(hazards=[("blocked", beside)]).only_watched(inside, lethal()) == watched
+    assert not places(hazards=[("blocked", beside)], zones=[zone]).only_watched(inside, lethal())
 
 
 def test_only_the_map_decides_whether_a_place_is_blocked():
@@ -408,5 +417,5 @@ def test_zone_that_is_not_in_force_is_no_reason_to_stop_for_an_own_obstacle():
     assert report([(5.02, 5.02), (5.04, 5.04)], reporter=reporter).points
     zone = Zone(id="nights", kind="BLOCKED", shape=CircleShape(centre=(5.0, 5.0), radius=1.0))
     assert places(zones=[zone]).containing(HERE, lethal(), reporter, 0.0) == "the no-go zone nights"
-    assert not places(hazards=[("blocked", SQUARE)], zones=[zone]).only_watched(HERE)
+    assert not places(hazards=[("blocked", SQUARE)], zones=[zone]).only_watched(HERE, lethal())
     assert places(zones=[zone], off=["nights"]).containing(HERE, lethal(), reporter, 0.0) is None

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from fog_contracts.follower import MapFollower
+    from fog_contracts.geometry import Point
     from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
     from fog_contracts.messages import (
@@ -90,15 +91,17 @@ class BlockedPlaces:
         """Return the name of the area or zone that blocks where the robot's centre is (m, frame `map`), if one does."""
         return self._named(pose) if _is_blocked(replica, pose) else None
 
-    def only_watched(self, pose: Pose2) -> bool:
+    def only_watched(self, pose: Pose2, replica: Replica) -> bool:
         """Whether no operator, but sensors may block where the robot's centre is: who passes it is gone again.
 
-        An area that is clear counts, too: the map may follow a moment later.
+        An area that is clear counts, too: the map may follow a moment later. So does one that only touches the cell:
+        the map blocks that as well.
         """
-        areas = (area for area in self._hazards.values() if contains_point(area.polygon, pose.x, pose.y))
+        corners = _corners(replica, pose)
+        areas = (area for area in self._hazards.values() if any(contains_point(area.polygon, *at) for at in corners))
         hazards = [area.hazard for area in areas]
         overridden = any(hazard.override is not None for hazard in hazards)
-        zones = any(shape_contains(zone.shape, pose.x, pose.y) for zone in self._zones)
+        zones = any(shape_contains(zone.shape, *at) for zone in self._zones for at in corners)
         return bool(hazards) and not overridden and not zones
 
     def closed(self, geometry: GridGeometry) -> dict[str, Spans]:
@@ -147,6 +150,15 @@ def _is_blocked(replica: Replica, pose: Pose2) -> bool:
     if not geometry.contains_cell(column, row):
         return False
     return bool(replica.cost[row, column] == LETHAL and replica.static[row, column] != LETHAL)
+
+
+def _corners(replica: Replica, pose: Pose2) -> list[Point]:
+    """Return the corners of the pose's cell (m), a hair outside of it; none where the map is not blocked."""
+    if replica.geometry is None or not _is_blocked(replica, pose):
+        return []
+    x, y = replica.geometry.centre(*replica.geometry.cell(pose.x, pose.y))
+    half = 0.5 * replica.geometry.resolution + 1e-6
+    return [(x + a * half, y + b * half) for a in (-1, 1) for b in (-1, 1)]
 
 
 _STEP_M: Final = 0.05
@@ -319,7 +331,7 @@ class Navigation:
 
     def inside_watched(self, pose: Pose2) -> bool:
         """Whether what blocks the place of a robot is sensors alone, which also tell when it is clear again."""
-        return self._places.only_watched(pose)
+        return self._places.only_watched(pose, self.replica)
 
     def blocked_ahead(self, pose: Pose2, way: float, reporter: ObstacleReporter, now: float) -> str | None:
         """Return the name of a blocked place that the body would reach, `way` m straight ahead; None at 0 m."""

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from fog_contracts.messages import Refusal, RobotPath, RobotState, SimTruth
+from fog_contracts.messages import Mode, Refusal, RobotPath, RobotState, SimTruth
 from fog_contracts.site import AreaSite
 from fognav_sim.drive.drive import FALSE_ARRIVAL_S, REFUSAL_GRACE_S, DriveEvaluation
 
@@ -21,9 +21,9 @@ def truth(x: float, y: float = 0.0, **more: Any) -> SimTruth:
     return SimTruth(robot="r1", x=x, y=y, theta=0.0, left=0.0, right=0.0, **fields)
 
 
-def state(*, reached: bool, goal: str | None = "g") -> RobotState:
+def state(*, reached: bool = False, goal: str | None = "g", mode: Mode = "NORMAL") -> RobotState:
     return RobotState(
-        mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=goal, map_epoch=1, map_seq=1, plan_id=1,
+        mode=mode, reasons=[], enabled=True, battery=None, goal_id=goal, map_epoch=1, map_seq=1, plan_id=1,
         goal_reached=reached,
     )  # fmt: skip
 
@@ -101,7 +101,9 @@ def test_refusal_ends_the_drive_only_if_it_lasts() -> None:
     assert outcome(drive, 105.0 + REFUSAL_GRACE_S - 0.1) is None
     drive.on_path(path(), 110.0)
     assert outcome(drive, 105.0 + REFUSAL_GRACE_S + 1.0) is None
-    drive.on_path(path(refusal), 130.0)
+    drive.on_path(path(refusal), 120.0)
+    drive.on_state(state(mode="EGRESS"), 130.0)  # an operator leads it out of the area that closed round it
+    assert outcome(drive, 120.0 + REFUSAL_GRACE_S + 1.0) is None
     result = drive.outcome(130.0 + REFUSAL_GRACE_S + 0.1)
     assert result is not None
     assert result.kind == "refused"

@@ -12,7 +12,7 @@ WAITING = "not_enabled"
 def state(mode: Mode, *codes: str, enabled: bool = True, reached: bool = False) -> RobotState:
     return RobotState(
         mode=mode, reasons=list(codes), codes=list(codes), enabled=enabled and mode != "INIT", battery=None,
-        goal_id="g", map_epoch=1, map_seq=1, plan_id=1, goal_reached=reached,
+        goal_id="g", map_epoch=1, map_seq=1, plan_id=1, goal_reached=reached, awaits_operator="passes" not in codes,
     )  # fmt: skip
 
 
@@ -49,10 +49,10 @@ def test_operator_responds_to_a_stop_after_a_time_that_starts_with_the_mode(
     assert policy.command_due(10.0 + after_s) == command
 
 
-@pytest.mark.parametrize("mode", ["NORMAL", "DEGRADED"])
-def test_no_command_is_due_while_the_robot_drives(mode: Mode) -> None:
+@pytest.mark.parametrize("mode", ["NORMAL", "DEGRADED", "PROTECTIVE_STOP"])
+def test_no_command_is_due_while_the_robot_drives_or_goes_on_by_itself(mode: Mode) -> None:
     policy = OperatorPolicy(0.0)
-    policy.on_state(state(mode), 0.0)
+    policy.on_state(state(mode, "passes"), 0.0)
     assert policy.command_due(1e6) is None
     assert policy.ready_s(1e6) == 0.0
 

@@ -27,7 +27,7 @@ GOAL_TOLERANCE_M: Final = 0.30
 FALSE_ARRIVAL_S: Final = 3.0
 """How long a robot that reports its arrival, but is elsewhere, may correct its position before the drive ends."""
 REFUSAL_GRACE_S: Final = 20.0
-"""How long a refusal must last to end the drive: the hazard behind it may clear."""
+"""How long a refusal must last to end the drive: the hazard behind it may clear, or an operator lead the robot out."""
 
 _SLOWEST_M_S: Final = 0.08
 """Mean speed, stops included, below which a drive times out."""
@@ -112,6 +112,8 @@ class DriveEvaluation:
             self.modes[state.mode] += 1
             if state.mode in {"PROTECTIVE_STOP", "FAULT"}:
                 self.stops.append(f"{state.mode}: {'; '.join(state.reasons) or 'no reason given'}")
+        if state.mode == "EGRESS" and self._refused_at is not None:
+            self._refused_at = now
         if state.plan_id is not None and state.goal_id == self.goal_id:
             self.followed.add((state.planner_epoch, state.plan_id))
         if state.goal_reached and state.goal_id in {self.goal_id, None}:

@@ -8,8 +8,8 @@ from fog_contracts.messages import ReasonCode, RobotState
 OperatorCommand = Literal["enable", "reset"]
 
 STOP_RESPONSE_S: Final = 5.0
-"""After this long in a protective stop a robot is enabled again. A robot that has just started has as long to become
-ready by itself."""
+"""After this long in a protective stop a robot that waits for it is enabled again. One that has just started has as
+long to become ready by itself."""
 HOLD_RESPONSE_S: Final = 61.0
 """After 60 s in HOLD a robot waits for an operator."""
 FAULT_RESPONSE_S: Final = 2.0
@@ -55,7 +55,9 @@ class OperatorPolicy:
             return "reset" if in_mode_s >= FAULT_RESPONSE_S else None
         # A robot that is not ready is enabled too in the end: its refusal names what is missing.
         waits = state.mode == "INIT" and (waits_only_for_operator(state) or in_mode_s >= STOP_RESPONSE_S)
-        waits = waits or (state.mode == "PROTECTIVE_STOP" and in_mode_s >= STOP_RESPONSE_S)
+        # One that was stopped by what ends by itself goes on by itself.
+        stopped = state.mode == "PROTECTIVE_STOP" and state.awaits_operator
+        waits = waits or (stopped and in_mode_s >= STOP_RESPONSE_S)
         waits = waits or (state.mode == "HOLD" and in_mode_s >= HOLD_RESPONSE_S)
         return "enable" if waits else None
 

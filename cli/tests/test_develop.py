@@ -47,6 +47,11 @@ def test_checks_run_in_parallel_in_the_checkout(tmp_path: Path) -> None:
     assert all(result.ok for result in results)
 
 
+def test_checks_that_import_kernels_compile_none(tmp_path: Path) -> None:
+    results, _ = run(tmp_path, python("imports", "import os; print(os.environ['NUMBA_DISABLE_JIT'])"))
+    assert [result.output for result in results] == ["1"]
+
+
 def test_at_most_one_check_per_core_runs_at_once(tmp_path: Path) -> None:
     exclusive = "import pathlib\np = pathlib.Path('busy')\np.touch(exist_ok=False)\np.unlink()"
     results, ended = run(tmp_path, *(python(name, exclusive) for name in "abc"), cores=1)

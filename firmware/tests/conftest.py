@@ -1,6 +1,7 @@
 """The firmware's core, compiled once for all tests of the firmware."""
 
 import os
+import tempfile
 from pathlib import Path
 
 import msgspec
@@ -37,14 +38,16 @@ def compiler():
 @pytest.fixture(scope="session")
 def built(tmp_path_factory):
     """Where what is compiled goes, and the further options: those that count lines, when `.ci/firmware` asks for it."""
-    counted = os.environ.get("FOGNAV_FIRMWARE_COVERAGE")
-    return (Path(counted), ("--coverage", "-O0")) if counted else (tmp_path_factory.mktemp("firmware"), ())
+    if counted := os.environ.get("FOGNAV_FIRMWARE_COVERAGE"):
+        # Each worker of a run, and each run, counts its own: another one's compilation would void what was counted.
+        return Path(tempfile.mkdtemp(dir=counted)), ("--coverage", "-O0")
+    return tmp_path_factory.mktemp("firmware"), ()
 
 
 @pytest.fixture(scope="session")
 def library(compiler, built):
     folder, counted = built
-    return build_library(folder, (*FLAGS, *(counted or UNDEFINED)))
+    return build_library(folder, (*FLAGS, *UNDEFINED, *counted))
 
 
 @pytest.fixture(scope="session")

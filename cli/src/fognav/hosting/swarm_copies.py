@@ -38,6 +38,9 @@ _LEADER: Final = """\
 """How a gateway finds the copy that leads; what comes during a takeover waits for it."""
 _UPSTREAM: Final = re.compile(rf"reverse_proxy ({'|'.join(SERVICES)}):8000 {{\n")
 _TARGET: Final = re.compile(rf'"({"|".join(SERVICES)}):8000"')
+_GIVE_UP: Final = {"net.ipv4.tcp_retries2": 5}
+"""After 13 s without an acknowledgement a connection ends, rather than after 15 minutes: zenoh waits for that before it
+gives a link up to whose other end it sends much, and so for a router that was cut off."""
 _PROCESS: Final = '"([^:]+):.*"'
 
 
@@ -77,6 +80,8 @@ def _on(service: _Part, name: str, machine: int) -> _Part:
     both = (machine, other)
     if machine > 1:  # two machines with the same label by mistake must not share data
         service["volumes"] = [re.sub(r"^([a-z-]+)(?<!-locks):", rf"\1-{machine}:", each) for each in service["volumes"]]
+    if name in (*SERVICES, "zenoh"):
+        service["sysctls"] = _GIVE_UP
     if name in SERVICES:
         sentinels = ",".join(f"{named(_SENTINEL, each)}:{SENTINEL_PORT}" for each in range(1, MACHINES + 1))
         service["environment"] = {

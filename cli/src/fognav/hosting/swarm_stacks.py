@@ -44,7 +44,7 @@ LIMIT: Final = 500 * 1024
 """Bytes of a secret or config (Docker Engine 20.10)."""
 KEPT: Final = frozenset(
     {"image", "user", "command", "entrypoint", "environment", "healthcheck", "init", "read_only"}
-    | {"cap_add", "cap_drop", "logging"}
+    | {"cap_add", "cap_drop", "logging", "sysctls"}
 )
 """What a stack file has as the compose file has it."""
 CHANGED: Final = frozenset({"volumes", "ports", "networks", "network_mode", "mem_limit", "scale", "tmpfs"})

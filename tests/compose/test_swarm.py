@@ -23,11 +23,11 @@ import pytest
 import yaml  # type: ignore[import-untyped]  # PyYAML ships no types
 from compose_project import BUILD_S, ROOT, Project, skip_reason, third_party
 from swarm_engines import Engine, Swarm, missing, wait
+from swarm_warnings import Place, Warnings
 
 from fog_contracts.channels import MAP_HEARTBEAT
 from fog_contracts.messages import MapHeartbeat
 from fog_runtime.clock import SystemClock
-from fog_runtime.credentials import Credentials
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav.hosting.swarm_stacks import write_stacks
 
@@ -50,6 +50,7 @@ READY_S: Final = 1200.0
 WRITERS: Final = 4
 PATIENCE_S: Final = 3.0
 """For how long a writer waits for its answer."""
+BEFORE_S: Final = 15.0
 CUT_OFF_S: Final = 60.0
 LEADING: Final = ("hazard-aggregator", "map-service", "planner")
 """Those of which one copy leads."""
@@ -95,8 +96,11 @@ class Floor:
         self._folder = folder
         self._stack = write_stack(folder, swarm.engines)
         locks = folder / "stacks" / SITE / "locks"
-        self.token = {"Authorization": f"Bearer {(locks / 'admin.token').read_text('ascii').strip()}"}
-        self.robot = Credentials.read(locks / "credentials" / "r1.toml")
+        token = (locks / "admin.token").read_text("ascii").strip()
+        large = [engine.address for engine in swarm.engines[:2]]
+        self.place = Place(folder / "site", locks / "credentials", token, large, large)
+        self.token = {"Authorization": f"Bearer {token}"}
+        self.robot = self.place.of("r1")
         self._tls = self.robot.tls_context()
 
     def on(self, engine: Engine) -> set[str]:
@@ -131,12 +135,13 @@ class Floor:
             engine = self.engines[machine - 1]
             before = {each["Id"] for each in engine.containers().values()}
             self.deploy(f"{SITE}.{machine}")
-            replaced = partial(self._replaced, engine, before)
+            replaced = partial(self.replaced, engine, before)
             wait(replaced, READY_S, f"{engine.name} runs what it had before")
             self.wait_ready()
 
     @staticmethod
-    def _replaced(engine: Engine, before: set[str]) -> bool:
+    def replaced(engine: Engine, before: set[str]) -> bool:
+        """Whether an engine runs none of these containers."""
         return not before & {each["Id"] for each in engine.containers().values()}
 
     def unready(self) -> dict[str, set[str]]:
@@ -289,16 +294,18 @@ class Witness:
         holders: dict[tuple[str, int], set[str]] = {}
         for term in terms:
             holders.setdefault((term.service, term.epoch), set()).add(term.holder)
+        no_map_s = _longest(self._heard, since)
         twice = {epoch: names for epoch, names in holders.items() if len(names) > 1}
         figures = {
             **what, "acknowledged": len(self._acknowledged), "lost": self._lost, "refused": self._refused,
             "leads_after_s": took, "no_write_s": _longest(self._acknowledged, since),
-            "no_map_s": _longest(self._heard, since), "outdated": self._outdated,
+            "no_map_s": no_map_s, "outdated": self._outdated,
             "load": os.getloadavg(),
         }  # fmt: skip
         print(json.dumps(figures), flush=True)  # noqa: T201  # shown by `-s`
         assert self._lost == 0
         assert twice == {}
+        assert no_map_s < CUT_OFF_S, "the robot has no map until all is well again"
 
 
 def _longest(times: Sequence[float], since: float) -> float:
@@ -350,15 +357,15 @@ def endure(
 ) -> Engine:
     """Do something to a machine that leads, while the other one is written to; return it when all is well again."""
     first, second, led, primary = victim(floor)
-    witness = Witness(floor, [second])
-    with ExitStack() as healing, witness.watching():
+    witness, warnings = Witness(floor, [second]), Warnings(floor.place._replace(gateways=[second.address]))
+    with ExitStack() as healing, warnings.coming(), witness.watching():
         healing.callback(heal, first)
-        time.sleep(5.0)
-        since = time.time()
+        time.sleep(BEFORE_S)
+        since = warnings.with_next()
         act(first)
         time.sleep(lasts_s)
     floor.wait_ready()
-    witness.judge(since, led, what=what, primary=primary)
+    witness.judge(since, led, what=what, primary=primary, echo_to_path=warnings.figures(since))
     return first
 
 
@@ -367,18 +374,22 @@ def test_machine_that_dies_loses_no_acknowledged_write(floor: Floor) -> None:
 
 
 def test_machine_that_is_cut_off_acknowledges_nothing_and_lives_on(floor: Floor) -> None:
-    answers = []
+    answers: list[str] = []
+    running: dict[str, Any] = {}
 
     def cut(engine: Engine) -> None:
         engine.cut_off()
-        begun, running = time.monotonic(), engine.containers()
+        begun = time.monotonic()
+        running.update(engine.containers())
         while time.monotonic() - begun < CUT_OFF_S:
             answers.append(write_inside(floor, engine))
         own = {name: each["Id"] for name, each in engine.containers().items()}
         assert own == {name: each["Id"] for name, each in running.items()}, "its engine has ended some"
         engine.reconnect()
 
-    endure(floor, "cut off", cut, Engine.reconnect, 15.0)
+    engine = endure(floor, "cut off", cut, Engine.reconnect, 15.0)
+    replaced = partial(floor.replaced, engine, {each["Id"] for each in running.values()})
+    wait(replaced, READY_S, "Swarm starts all of a machine anew that was away")
     assert not [each for each in answers if each.startswith("2")], "only one machine has it"
 
 
@@ -407,8 +418,8 @@ def test_machine_that_is_drained_hands_over_and_takes_part_again(floor: Floor) -
 
 def test_upgrade_of_one_machine_after_the_other_keeps_a_leader(floor: Floor) -> None:
     first, second, led, primary = victim(floor)
-    witness = Witness(floor, [first, second])
-    with witness.watching():
-        since = time.time()
+    witness, warnings = Witness(floor, [first, second]), Warnings(floor.place)
+    with warnings.coming(), witness.watching():
+        since = warnings.with_next()
         floor.upgrade()
-    witness.judge(since, led, what="upgraded", primary=primary)
+    witness.judge(since, led, what="upgraded", primary=primary, echo_to_path=warnings.figures(since))

@@ -173,7 +173,7 @@ async def measure(
             await stack.supervisor.wait_ready([*SERVERS, *programs], READY_S)
         except NotReadyError as error:
             raise FailedError(f"{error}\n{log_tail(stack.log(PLANNERS[1]))}") from error
-        await contexts.enter_async_context(running_nodes(stack, loaded, floor))
+        await contexts.enter_async_context(running_nodes(loaded, floor, stack.mqtt_url, stack.security.credentials))
         own = session_config("client", connect=[stack.zenoh_endpoint], credentials=stack.security.credentials(BENCH))
         session = await asyncio.to_thread(zenoh.open, own)
         contexts.callback(session.close)
@@ -204,7 +204,7 @@ class _Changes(Trials):
     async def change(self, number: int) -> None:
         """Measure one obstacle in each phase; the planner that leads then becomes slow, lossy or dead."""
         leader = await self._leader()
-        self._took["before"].append(await self.meet(await self.drive(3 * number), self._path_around))
+        self._took["before"].append(await self.meet(await self.drive(3 * number), self.path_around))
         hazard = await self.drive(3 * number + 1)
         await self._forget_pause()
         epoch = self.robot.latest().planner_epoch
@@ -215,7 +215,7 @@ class _Changes(Trials):
             await asyncio.sleep(-fails_after_s)
         # A planner that has taken over already may have chosen another way, which the obstacle does not close.
         if self._enters(hazard):
-            self._took["during"].append(await self.meet(hazard, self._path_around))
+            self._took["during"].append(await self.meet(hazard, self.path_around))
         failed_at = await failing
 
         for _ in range(round(TIMEOUT_S / POLL_S)):
@@ -223,7 +223,7 @@ class _Changes(Trials):
                 await asyncio.sleep(POLL_S)
         if self.robot.latest().planner_epoch > epoch:
             self._taken_over.append(self.robot.taken_over[self.robot.latest().planner_epoch] - failed_at)
-            self._took["after"].append(await self.meet(await self.drive(3 * number + 2), self._path_around))
+            self._took["after"].append(await self.meet(await self.drive(3 * number + 2), self.path_around))
         for way in self.ways.values():
             way.set()
         await self.stack.supervisor.wait_ready(PLANNERS, READY_S)
@@ -271,19 +271,6 @@ class _Changes(Trials):
         redis = RedisConnection(self.stack.redis_url, timeout_s=READY_S, credentials=own)
         await redis.write(("DEL", f"fog:{self.loaded.site.id}:planner:handed"))
         await redis.aclose()
-
-    async def _path_around(self, area: str, placed: float) -> float | None:
-        """Return the time (s) from the first echo to the first path around the area; None without one in time.
-
-        A planner that has just taken over does not know which hazard its first path answers: it names none.
-        """
-        deadline = time.monotonic() + TIMEOUT_S
-        while time.monotonic() < deadline:
-            arrived = next((each.at for each in self.around(area) if each.at >= placed), None)
-            if arrived is not None and self.world.echo is not None:
-                return arrived - self.world.echo
-            await asyncio.sleep(POLL_S)
-        return None
 
 
 def row(fault: Fault, phase: str, took: Sequence[float | None], taken_over: Sequence[float]) -> dict[str, Any]:

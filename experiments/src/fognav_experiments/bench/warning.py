@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import random
 import time
+from abc import ABC, abstractmethod
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Pose, Trace
     from fog_contracts.site import NodeSite
     from fog_runtime.configuration.site import LoadedSite
+    from fog_runtime.credentials import Credentials
+    from fog_supervisor import net
     from fognav_sim.drive.hazard import PlannedHazard
 
     TraceKey = tuple[str, int, int]  # area, epoch and sequence number
@@ -144,7 +147,7 @@ async def measure(
             await stack.supervisor.wait_ready([*SERVERS, *SERVICES], READY_S)
         except NotReadyError as error:
             raise FailedError(f"{error}\n{log_tail(stack.log(PLANNER))}") from error
-        async with running_nodes(stack, loaded, floor):
+        async with running_nodes(loaded, floor, stack.mqtt_url, stack.security.credentials):
             own = stack.security.credentials(BENCH)
             settings = session_config("client", connect=[stack.zenoh_endpoint], credentials=own)
             with await asyncio.to_thread(zenoh.open, settings) as session:
@@ -166,28 +169,26 @@ def figures(rule: str, warned: Sequence[Warned | None]) -> dict[str, Any]:
 
 
 @asynccontextmanager
-async def running_nodes(stack: Stack, loaded: LoadedSite, floor: StillFloor) -> AsyncIterator[None]:
-    """Run all nodes of the site, each with its own connection."""
+async def running_nodes(
+    loaded: LoadedSite, floor: StillFloor, brokers: str, credentials: Callable[[str], Credentials]
+) -> AsyncIterator[None]:
+    """Run all nodes of the site, each with its own connection to one of the `brokers` (comma separated)."""
     clock = SystemClock()
     nodes = [
-        VirtualNode(
-            sensor, floor, stack.mqtt_url, clock, loaded.site.id, stack.security.credentials(sensor.node.id)
-        )
+        VirtualNode(sensor, floor, brokers, clock, loaded.site.id, credentials(sensor.node.id))
         for sensor in make_nodes(loaded.site.nodes, int(time.time()), clock.now(), "firmware", apart=0.025)
-    ]  # fmt: skip
+    ]
     async with in_background(run_nodes(nodes, clock, _NODES_STEP_S), "nodes"):
         yield
 
 
-class Trials:
+class Obstacles(ABC):
     """Obstacles that come and go in an area on the robot's way; the one of `planners` that leads takes the goals."""
 
     planners: Sequence[str] = (PLANNER,)
 
-    def __init__(
-        self, stack: Stack, loaded: LoadedSite, world: WatchedWorld, session: zenoh.Session, seed: int
-    ) -> None:
-        self.stack, self.loaded, self.world = stack, loaded, world
+    def __init__(self, loaded: LoadedSite, world: WatchedWorld, session: zenoh.Session, seed: int) -> None:
+        self.loaded, self.world = loaded, world
         self._seed = seed
         self.random = random.Random(seed)  # noqa: S311  # repeatable, no secret
         self._deltas = _Deltas()
@@ -198,13 +199,13 @@ class Trials:
         self.robot = StandingRobot(session, site.id, robot.id, robot.start)
         session.declare_subscriber(ch.MAP_DELTA.key(site=site.id), self._deltas.on_delta)
 
-    async def run(self, number: int, on_progress: Callable[[], object]) -> Warned | None:
-        """Measure one warning, and clear up after it; None if the robot was not warned."""
-        hazard = await self.drive(number)
-        await asyncio.sleep(self.random.uniform(0.0, _PHASE_S))
-        warned = await self.meet(hazard, self._warned)
-        on_progress()
-        return warned
+    @abstractmethod
+    async def ask(self, service: str, method: str, path: str, body: object = None) -> net.Response:
+        """Send a request to a service; return its answer, also a refusal; raises `OSError` if it does not answer."""
+
+    @abstractmethod
+    def logs(self) -> str:
+        """Return what the services said last."""
 
     async def meet(self, hazard: PlannedHazard, warned: Callable[[str, float], Awaitable[T]]) -> T:
         """Place the obstacle, return what `warned` does, given its area and when it was placed, and clear up."""
@@ -235,7 +236,7 @@ class Trials:
             path = f"/api/v1/robots/{self.robot.id}/goal"
             for planner in self.planners:  # a lease may change hands at any time
                 try:
-                    answer = await ask(self.stack, planner, "PUT", path, where)
+                    answer = await self.ask(planner, "PUT", path, where)
                 except OSError as error:  # one whose Redis is slow may not answer in time
                     self.said = f"{planner} did not answer: {error}"
                     continue
@@ -257,6 +258,58 @@ class Trials:
         except BarrierError as error:
             raise FailedError(str(error)) from error
 
+    async def path_around(self, area: str, placed: float) -> float | None:
+        """Return the time (s) from the first echo to the first path around the area; None without one in time.
+
+        A planner that has just taken over does not know which hazard its first path answers: it names none.
+        """
+        deadline = time.monotonic() + TIMEOUT_S
+        while time.monotonic() < deadline:
+            arrived = next((each.at for each in self.around(area) if each.at >= placed), None)
+            if arrived is not None and self.world.echo is not None:
+                return arrived - self.world.echo
+            await asyncio.sleep(POLL_S)
+        return None
+
+    async def _clear(self) -> bool:
+        """Whether the aggregator believes all nodes, and none of them sees anything."""
+        answer = await self.ask(AGGREGATOR, "GET", "/api/v1/nodes")
+        return isinstance(answer.body, list) and all(node["state"] == "clear" for node in answer.body)
+
+    async def until(self, condition: Callable[[], Any], what: str) -> None:
+        """Wait for a condition; raises `FailedError` with `what` was waited for after a long time."""
+        deadline = time.monotonic() + READY_S
+        while not await condition():
+            if time.monotonic() > deadline:
+                raise FailedError(f"waited {READY_S:.0f} s until {what}; {self.said}\n{self.logs()}")
+            await asyncio.sleep(POLL_S)
+
+
+class Trials(Obstacles):
+    """Obstacles before the nodes of a stack of this machine."""
+
+    def __init__(
+        self, stack: Stack, loaded: LoadedSite, world: WatchedWorld, session: zenoh.Session, seed: int
+    ) -> None:
+        super().__init__(loaded, world, session, seed)
+        self.stack = stack
+
+    async def ask(self, service: str, method: str, path: str, body: object = None) -> net.Response:
+        """Send a request to a service; return its answer."""
+        return await ask(self.stack, service, method, path, body)
+
+    def logs(self) -> str:
+        """Return the ends of the services' logs."""
+        return "\n".join(log_tail(self.stack.log(name)) for name in (AGGREGATOR, MAP_SERVICE, *self.planners))
+
+    async def run(self, number: int, on_progress: Callable[[], object]) -> Warned | None:
+        """Measure one warning, and clear up after it; None if the robot was not warned."""
+        hazard = await self.drive(number)
+        await asyncio.sleep(self.random.uniform(0.0, _PHASE_S))
+        warned = await self.meet(hazard, self._warned)
+        on_progress()
+        return warned
+
     async def _warned(self, area: str, placed: float) -> Warned | None:
         deadline = time.monotonic() + TIMEOUT_S
         while time.monotonic() < deadline:
@@ -265,21 +318,6 @@ class Trials:
                 return warned
             await asyncio.sleep(POLL_S)
         return None
-
-    async def _clear(self) -> bool:
-        """Whether the aggregator believes all nodes, and none of them sees anything."""
-        answer = await ask(self.stack, AGGREGATOR, "GET", "/api/v1/nodes")
-        return isinstance(answer.body, list) and all(node["state"] == "clear" for node in answer.body)
-
-    async def until(self, condition: Callable[[], Any], what: str) -> None:
-        """Wait for a condition; raises `FailedError` with `what` was waited for after a long time."""
-        deadline = time.monotonic() + READY_S
-        while not await condition():
-            if time.monotonic() > deadline:
-                names = (AGGREGATOR, MAP_SERVICE, *self.planners)
-                logs = "\n".join(log_tail(self.stack.log(name)) for name in names)
-                raise FailedError(f"waited {READY_S:.0f} s until {what}; {self.said}\n{logs}")
-            await asyncio.sleep(POLL_S)
 
 
 class Arrived(NamedTuple):

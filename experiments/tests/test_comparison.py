@@ -257,7 +257,6 @@ def short_run(tmp_path_factory):
     return folder, [first, *rest]
 
 
-@pytest.mark.drive
 def test_a_run_that_was_killed_goes_on_where_it_was(short_run):
     folder, records = short_run
     assert [record.setup for record in records] == SETUPS
@@ -269,7 +268,6 @@ def test_a_run_that_was_killed_goes_on_where_it_was(short_run):
     assert not comparable([first, rest[0]]) or first.sitting == rest[0].sitting
 
 
-@pytest.mark.drive
 def test_robots_that_the_fog_warns_drive_less_than_one_that_finds_out_by_itself(short_run):
     default, lean, full, fog = short_run[1]
     assert all(record.success for record in short_run[1]), [record.reason for record in short_run[1]]
@@ -279,7 +277,6 @@ def test_robots_that_the_fog_warns_drive_less_than_one_that_finds_out_by_itself(
     assert full.distance_m == pytest.approx(fog.distance_m, abs=1.0)
 
 
-@pytest.mark.drive
 def test_a_drive_begins_in_every_setup_when_the_robot_is_ready(short_run):
     moves = [next(at for at, *_ in record.timeline.poses[1:]) for record in short_run[1]]
     assert max(moves) - min(moves) < 0.6, moves

@@ -113,6 +113,7 @@ def test_walls_are_where_they_are_in_the_building(mapped):
     assert (at(solid, FREE) == 0).mean() > 0.99
 
 
+@pytest.mark.drive
 def test_loops_are_found_all_true_and_join_what_odometry_tore_apart(mapped):
     scans, truth, found = mapped
     odometry = np.array([scan.odometry for scan in scans])

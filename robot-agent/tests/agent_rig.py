@@ -277,7 +277,7 @@ async def until(condition, expected: str, deadline_s: float = DEADLINE_S):
 
 
 def is_by_delay(reason: str) -> bool:
-    """Return whether a robot's reason for the end of a maneuver is that its computer, or the emulated body, was late."""
+    """Return whether a robot says that a maneuver ended because its computer, or the emulated body, was late."""
     late = ("the agent sent no fresh command", "; this computer was ", "the lidar has been silent for")
     return any(words in reason for words in late)
 

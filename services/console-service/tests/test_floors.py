@@ -80,6 +80,8 @@ async def floors(fog, tmp_path_factory, proxy_of, tokens):
         stack.callback(upstairs.close)
         site = upstairs.site / "site.toml"
         site.write_text(site.read_text().replace('id = "test"', 'id = "upstairs"'))
+        # Before its services read the tokens: one that is made later is unknown to some of them for a while.
+        token = create_token(upstairs.folder / "tokens.toml", "floor test", "viewer")
         for each in (fog, upstairs):
             for module in SERVICES:
                 each.start(module)
@@ -87,7 +89,6 @@ async def floors(fog, tmp_path_factory, proxy_of, tokens):
         port = int((await upstairs.ready("console_service")).rpartition(":")[2])
         proxy = proxy_of(SimpleNamespace(port=port))
         address = f"http://127.0.0.1:{await proxy.start()}"
-        token = create_token(upstairs.folder / "tokens.toml", "floor test", "viewer")
         (fog.folder / "upstairs.toml").write_text(f'user = "floor test"\ntoken = "{token}"\n')
         listed = fog.folder / "floors.toml"
         listed.write_text(f'[floors.upstairs]\naddress = "{address}"\ncredentials = "upstairs.toml"\n')

@@ -305,6 +305,8 @@ async def test_robot_rides_to_a_place_of_another_floor_and_only_that_floor_has_i
     refused = await building.call("ground", "PUT", "/goal", json={"place": "desk"})
     assert refused.status_code == 409
     assert "it has left for upstairs" in refused.json()["detail"]
+    refused = await building.call("ground", "DELETE", "/goal")
+    assert (refused.status_code, "cancel it there" in refused.json()["detail"]) == (409, True)
     back = await building.call("ground", "DELETE", "/out-of-service")
     assert back.status_code == 409, "nobody can say that it is here while it is there"
 

@@ -12,7 +12,7 @@ import pytest
 from manual_clock import ManualClock
 
 from fog_contracts.handover import next_berth
-from fog_contracts.messages import Berth, Place, PlanReply, Pose, RobotPose, RobotState
+from fog_contracts.messages import Berth, CommandReply, Place, PlanReply, Pose, Reason, RobotPose, RobotState
 from fog_contracts.site import LiftSite, Site
 from fog_runtime.health import Health
 from fog_runtime.http import ProblemError
@@ -20,7 +20,7 @@ from fog_runtime.stores.redis_connection import StoreError
 from fog_supervisor.servers import Server, start_redis
 from fognav_sim.lift import SimLift
 from planner.core import PlannerCore
-from planner.lifts.persistence import RidePersistence
+from planner.lifts.persistence import OnOtherFloorError, RidePersistence
 from planner.lifts.riding import Riding
 from planner.robot_operator import CommandError
 from planner.stops import GoalPose, MissionBody, StopBody
@@ -80,7 +80,7 @@ class Floor:
         self.clock = SetClock(building.clock)
         lift = LiftSite(id="north", cabin=pose(CABIN), wait=pose(WAIT), floors=list(FLOORS))
         self.site = Site(id=name, lifts=[lift])
-        self.places = {"desk": Place(x=3.0, y=0.0)}
+        self.places: dict[str, Place] | None = {"desk": Place(x=3.0, y=0.0)}
         self.operator: Any = SimpleNamespace(
             stopped_at=-1e9, heard=self.heard, fresh_state=self.fresh_state, hand_over=building.hand_over
         )
@@ -113,7 +113,7 @@ class Floor:
 
     async def order(self, *stops: StopBody, **options: Any) -> None:
         body, conditions = MissionBody(stops=list(stops), **options), Conditions("anna", None, None)
-        await self.send(await mission_order(cast("Any", self), "r1", body, self.places, conditions, 0.25))
+        await self.send(await mission_order(cast("Any", self), "r1", body, self.places or {}, conditions, 0.25))
 
     async def step(self) -> None:
         """Do what its loops do."""
@@ -137,6 +137,7 @@ class Building:
         self.told: list[tuple[str, float, str]] = []
         """Its goals: floor, x and id."""
         self.knows, self.carries, self.talks, self.stuck = list(FLOORS), True, True, False
+        self.deaf = False
         self.chance, self.rng = 0.0, random.Random(0)
 
     def fails(self) -> bool:
@@ -147,14 +148,15 @@ class Building:
         if not self.fails():
             self.lift.ask(asked, self.clock.now())
 
-    async def hand_over(self, _robot: str, given: HandOver) -> None:
-        if self.fails():
+    async def hand_over(self, _robot: str, given: HandOver) -> CommandReply:
+        if self.fails() or self.deaf:
             raise CommandError("it was not heard")
         after = next_berth(self.berth, given)
         if isinstance(after, Berth) and after != self.berth:
             self.berth, self.at = after, CABIN
         if self.fails():
             raise CommandError("its reply was not heard")
+        return CommandReply.refused(after) if isinstance(after, Reason) else CommandReply(accepted=True, reason="")
 
     @property
     def here(self) -> Floor:
@@ -298,6 +300,66 @@ async def test_mission_that_is_cancelled_ends_wherever_the_robot_is_then_and_doe
     await building.go_on()
     assert (building.told[-1], await building.stored()) == (told, [])
     assert (building.lift.session == "") == (building.at != CABIN), "it is held for a robot that is in it"
+
+
+@pytest.mark.parametrize("moment", ["not yet told", "told", "between", "comes", "in the lift"])
+async def test_mission_that_is_cancelled_between_two_floors_ends_outside_the_lift_and_no_restart_takes_it_up(
+    building: Building, moment: str
+) -> None:
+    ground, upstairs = building.floors.values()
+    await ground.order(DESK, UP, DOWN)
+    building.deaf = True
+    await building.go_on(until=lambda: "r1" in ground.missions.berths)
+    building.deaf, floor = False, ground if moment in {"not yet told", "told"} else upstairs
+    if moment != "not yet told":
+        await ground.step()
+        building.talks = moment != "between"
+    await upstairs.step()
+    if building.talks and floor is upstairs:
+        building.robot()
+    if moment == "in the lift":
+        await upstairs.step()
+        assert "mission from ground" in floor.riding.waits("r1")
+    if moment == "told":
+        ground.operator.heard = lambda _: building.state()  # its last word there, some seconds long
+        with pytest.raises(OnOtherFloorError, match="has left for upstairs, and its mission with it: cancel it there"):
+            await floor.riding.cancel("r1", "anna")
+        return
+    assert await floor.riding.cancel("r1", "anna")
+    assert not await floor.riding.cancel("r2", "anna")
+    entry = (await floor.store.audit(limit=1)).entries[0]
+    assert (entry.id, entry.action, entry.who) == ("r1", "cancel", "anna")
+    for each in building.floors.values():
+        await each.start()
+    building.talks = True
+    await building.go_on()
+    assert building.told[-1][:2] == ("upstairs", WAIT)
+    assert (building.stops, await building.stored(), building.lift.session) == ([], [], "")
+
+
+@pytest.mark.parametrize("stops", [[DESK, DOWN], [UP, DESK, DOWN]], ids=["the first stop there", "a later one"])
+@pytest.mark.parametrize("told", ["desk", "others", "never"])
+async def test_mission_to_a_place_waits_until_the_places_are_known_and_says_so(
+    building: Building, caplog: Any, stops: list[StopBody], told: str
+) -> None:
+    caplog.set_level("WARNING")
+    upstairs = building.floors["upstairs"]
+    upstairs.places, known = None, upstairs.places
+    await building.floors["ground"].order(*stops)
+    await building.go_on(until=lambda: "goes to desk once" in upstairs.riding.waits("r1"))
+    await building.go_on(20)
+    assert (len(building.stops), caplog.messages) == (len(stops) - 2, [])
+    assert "60 s at most" in upstairs.riding.waits("r1")
+    if told != "never":
+        upstairs.places = known if told == "desk" else {}
+    await building.go_on(until=lambda: "r1" not in upstairs.riding._waits)
+    await building.go_on()
+    if told == "desk":
+        assert building.stops[-2:] == [("upstairs", 3.0), ("ground", 2.0)]
+    else:
+        assert (len(building.stops), await building.stored()) == (len(stops) - 2, [])
+        assert caplog.messages == ["ride_without_goal" if stops[0] is DESK else "mission_given_up"]
+    assert upstairs.riding.waits("r1") == ""
 
 
 @pytest.mark.parametrize(

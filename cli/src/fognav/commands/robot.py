@@ -266,6 +266,8 @@ def robot_status(*, robot: RobotOption = None, fog: FogOption = None, json: Json
             print_answer(f"  out of service: {out['reason']} ({out['by']}{until}); fognav robot put-back ends that")
         if (goal := view["goal"]) is not None:
             print_answer(f"  goal: {goal['place'] or _position(goal['pose'])}")
+        if why := view.get("waits"):
+            print_answer(f"  waits: {why}")
         if (arrival := view.get("arrival")) is not None:
             times = f"{arrival['expected_s']:.0f} s ({arrival['earliest_s']:.0f} to {arrival['latest_s']:.0f})"
             print_answer(f"  arrives in {times}")

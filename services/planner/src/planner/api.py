@@ -80,10 +80,14 @@ class ServiceBody(Message, frozen=True, kw_only=True):
 
 
 class RobotView(RobotSummary, frozen=True, kw_only=True):
-    """A robot with its latest pose, state, goal and plan; `arrival`: null when it has no path, or waits."""
+    """A robot with its latest pose, state, goal and plan; `arrival`: null when it has no path, or waits.
+
+    `waits`: why its mission does not go on here yet, such as while it comes by a lift; empty when it does.
+    """
 
     pose: RobotPose | None
     arrival: Arrival | None = None
+    waits: str = ""
 
 
 def _goal_view(robot: str, stored: StoredGoal) -> GoalView:
@@ -143,6 +147,7 @@ class _Robots:
             plan=PlanView.of(service.path(robot)),
             out_of_service=service.missions.out_of_service(robot),
             arrival=service.arrival(robot) if robot in service.goals else None,
+            waits=service.riding.waits(robot),
             start=None if described is None else described.start,
             dock=None if described is None else described.dock,
         )
@@ -273,13 +278,17 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, places: Known
 
     @routes.delete(
         "/api/v1/robots/{robot}/goal",
-        raises=[MissionConflictError, StoreError],
+        raises=[MissionConflictError, OutOfServiceError, StoreError],
         problems=[PlannerProblem.NO_ROBOT, PlannerProblem.NO_MISSION],
     )
     async def delete_goal(robot: str, caller: Operator, if_match: IfMatch = None) -> None:
-        """Cancel a robot's mission; with If-Match, only if it is the one that was read."""
+        """Cancel a robot's mission; with If-Match, only if it is the one that was read.
+
+        Also one with which the robot is on its way to this floor, or from it to another one while it has not left yet:
+        it finishes its ride, and drives out of the lift. Once it has left, only the other floor can cancel it (409).
+        """
         robots.check(robot)
-        if not await service.missions.cancel(robot, caller.name, expected_tag(if_match)):
+        if not await service.riding.cancel(robot, caller.name, expected_tag(if_match)):
             raise _without_mission(robot)
 
 

@@ -232,9 +232,9 @@ class RobotOperator:
         await self._store.record_command(robot, msgspec.json.encode(detail), Audit(self._clock.stamp(), who, kind))
         return await self._deliver(kind, robot, who, state, pose)
 
-    async def hand_over(self, robot: str, given: HandOver) -> None:
-        """Tell a robot that it leaves this floor, which is recorded. Raises `CommandError`."""
-        await self._deliver("hand_over", robot, given.who, self.fresh_state(robot), given=given)
+    async def hand_over(self, robot: str, given: HandOver) -> CommandReply:
+        """Tell a robot that it leaves this floor, which is recorded; return its reply. Raises `CommandError`."""
+        return await self._deliver("hand_over", robot, given.who, self.fresh_state(robot), given=given)
 
     async def stop(self, robot: str, sender: str, *, each: bool = False) -> CommandReply:
         """Stop a robot for anybody, with a token or without; return its reply. Raises `CommandError`.

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import secrets
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from msgspec import structs
 
 from fog_contracts.handover import next_berth, standing
-from fog_contracts.messages import Berth, HandOver, OutOfService, Reason, RobotGoal
+from fog_contracts.messages import Berth, FloorGoal, HandOver, OutOfService, Reason, RobotGoal
 from fog_runtime import logs
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Audit
@@ -23,12 +23,23 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Pose, Stop, Tour
     from planner.stops import Ride
 
+OUT: Final = FloorGoal()
+"""The goal upstairs of a robot whose mission was cancelled on its way: out of the lift, and no further."""
+_CHANGED: Final = "another request has changed this robot's floor meanwhile: look, then repeat it"
+
 _log = logs.get("planner")
 
 
 def on_behalf(robot: str, given: HandOver | None) -> str:
     """Return who acts, for the audit trail: the robot, which says for whom."""
     return f"robot {robot}, for {given.who}"[:100] if given is not None and given.who else f"robot {robot}"
+
+
+def carries(given: HandOver | None, expected: str | None = None) -> bool:
+    """Whether a robot takes a mission along; with `expected`, the one of which that is a leg (`Tour.goal_id`)."""
+    if given is None or (given.mission is None and given.goal in {None, OUT}):
+        return False
+    return expected is None or (given.mission is not None and expected.rpartition("-")[0] == given.mission.id)
 
 
 class OnOtherFloorError(OutOfServiceError):
@@ -43,10 +54,13 @@ class RidePersistence(MissionPersistence):
 
     site = "none"
     """This floor."""
-    leg_to: Callable[[str, Stop, str], tuple[Stop, Ride | None] | str] = staticmethod(
+    leg_to: Callable[[str, Stop, str], tuple[Stop, Ride | None] | str | None] = staticmethod(
         lambda _robot, stop, _who: (stop, None)
     )
-    """Returns where a robot goes for a stop, for whom: there, or to the lift to its floor; or why it can't."""
+    """Returns where a robot goes for a stop, for whom: there, or to the lift to its floor; or why it can't.
+
+    None: that is not known yet.
+    """
 
     async def _load(self) -> None:
         self.berths = await self._store.berths()
@@ -73,8 +87,15 @@ class RidePersistence(MissionPersistence):
 
     def standing(self, robot: str) -> Standing | None:
         """Return what a robot is to this floor by its own latest word; None before one."""
-        said = self.said.get(robot)
+        said, announced = self.said.get(robot), self._announced(robot)
+        if said is not None and announced is not None and (said.floor, said.epoch) == (self.site, announced.epoch):
+            return "arrives"
         return None if said is None else standing(self.berths.get(robot), said, self.site)
+
+    def _announced(self, robot: str) -> HandOver | None:
+        """Return by what a robot is to come that is not here yet, and whose mission was cancelled here."""
+        given = known.came_by if (known := self.berths.get(robot)) is not None else None
+        return given if known is not None and given is not None and given.floor != known.floor else None
 
     def is_here(self, robot: str) -> bool:
         """Whether this floor sends the robot anywhere: both say so, or it was never handed over."""
@@ -91,7 +112,7 @@ class RidePersistence(MissionPersistence):
         berth = self.berths.get(robot)
         given = None if berth is None else berth.came_by
         if given is not None and given.lift is not None and f"{robot}/{given.epoch}" not in self.begun:
-            reason = "it is in a lift whose door is not open here yet"
+            reason = "it is in a lift whose door is not open here yet, or waits for the site's places"
             raise OnOtherFloorError(robot, OutOfService(id="lift", reason=reason, by=WHO, since=0.0))
         super().require_in_service(robot)
 
@@ -130,11 +151,19 @@ class RidePersistence(MissionPersistence):
         self, robot: str, stored: StoredGoal, stop: Stop, tour: Tour, *, who: str, action: str, ride: Ride | None = None
     ) -> None:
         found = self.leg_to(robot, stop, tour.who)
+        if found is None:
+            self._undecided[robot] = stored.goal.goal_id
+            return
         if isinstance(found, str):
             await self.give_up(robot, stored, "cut", found)
             return
         stop, ride = found
         await super()._replace(robot, stored, stop, tour, who=who, action=action, ride=ride)
+
+    async def _end_reached(self) -> None:
+        await super()._end_reached()
+        self._reached = {**self._undecided, **self._reached}
+        self._undecided.clear()
 
     async def leave(self, robot: str, stored: StoredGoal) -> None:
         """Record that a robot has left this floor, and end its mission here, which it takes along.
@@ -168,6 +197,8 @@ class RidePersistence(MissionPersistence):
         """Record that a robot has come; what was stored for it before ends. Raises `StoreError`."""
         who = on_behalf(robot, said.came_by)
         async with self._lock:
+            if (given := self._announced(robot)) is not None and given.epoch == said.epoch:
+                said = structs.replace(said, came_by=given)
             audit = Audit(self._clock.stamp(), who, "arrive")
             with self._uncertain_write():
                 if (old := (await self._store.goals()).get(robot)) is not None:
@@ -176,6 +207,33 @@ class RidePersistence(MissionPersistence):
                 self._cancel(robot)
             await self._put(robot, said, audit)
         _log.info("robot_arrived", robot=robot, epoch=said.epoch, who=who)
+
+    async def cancel_carried(self, robot: str, who: str, expected: str | None = None) -> HandOver | None:
+        """Cancel the mission that a robot takes along, unless this floor has given it already; None if there is none.
+
+        Returns the hand-over without it. Raises `StoreError`.
+        """
+        async with self._lock:
+            known = self.berths.get(robot)
+            given = None if known is None else known.came_by
+            if known is None or given is None or not carries(given, expected) or f"{robot}/{given.epoch}" in self.begun:
+                return None
+            changed = structs.replace(given, goal=OUT, mission=None, who=who, id=secrets.token_hex(8))
+            await self._note(robot, structs.replace(known, came_by=changed), who)
+        return changed
+
+    async def cancel_coming(self, robot: str, who: str, given: HandOver) -> None:
+        """Cancel the mission of a robot that is on its way here, whatever it takes along. Raises `StoreError`.
+
+        `given`: what this floor takes it to have come by, once it comes; until then its record names the other floor.
+        """
+        async with self._lock:
+            await self._note(robot, Berth(floor=given.origin, epoch=given.epoch, came_by=given), who)
+
+    async def _note(self, robot: str, berth: Berth, who: str) -> None:
+        if not await self._put(robot, berth, Audit(self._clock.stamp(), who, "cancel")):
+            raise StoreError(_CHANGED)
+        _log.info("ride_cancelled", robot=robot, who=who)
 
     async def settle(self, robot: str) -> None:
         """Record that a robot that has come is out of its lift. Raises `StoreError`."""
@@ -196,7 +254,7 @@ class RidePersistence(MissionPersistence):
             async with self._lock:
                 found = structs.replace(self.said[robot], came_by=None)
                 if not await self._put(robot, found, Audit(self._clock.stamp(), who, "in")):
-                    raise StoreError("another request has changed this robot's floor meanwhile: look, then repeat it")
+                    raise StoreError(_CHANGED)
             return True
         return await super().put_back(robot, who, **conditions)
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
+import secrets
 from typing import TYPE_CHECKING, Final, Protocol
 
 from msgspec import structs
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import Berth, LiftState, Pose, Refusal, Stop
+from fog_contracts.messages import Berth, HandOver, LiftState, OutOfService, Pose, Refusal, RefusalCode, Stop
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.http import ProblemError
 from fog_runtime.stores.redis_connection import StoreError
 from fog_runtime.stores.redis_store import Attempt, IdempotencyError
-from planner.lifts.persistence import on_behalf
+from planner.lifts.persistence import OUT, OnOtherFloorError, carries, on_behalf
 from planner.lifts.rides import Facts, cabins_at, cannot_leave, inside_of, lift_to, next_act, request, session
 from planner.problems import PlannerProblem
 from planner.robot_operator import CommandError
@@ -23,7 +25,7 @@ from planner.store import NO_MISSION, MissionConflictError, OutOfServiceError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from fog_contracts.messages import FloorGoal, HandOver, Place, RobotPose, RobotState
+    from fog_contracts.messages import Place, RobotPose, RobotState
     from fog_contracts.site import Site
     from fog_runtime.clock import Clock
     from fog_runtime.transports.zenoh_edge import ZenohEdge
@@ -32,10 +34,14 @@ if TYPE_CHECKING:
     from planner.store import StoredGoal
 
 STEP_S: Final = 0.5
+_SEEN_S: Final = 4 * STEP_S
+"""A mission that has not asked for a place for so long does not wait for it any more."""
 SILENT_S: Final = 60.0
 """A robot that was not heard for so long holds no lift any more: a restart takes less."""
 STOPPED_S: Final = 120.0
 """A robot that comes so soon after anybody has stopped robots here is stopped, too: the stop may have missed it."""
+PLACES_S: Final = 60.0
+"""A mission waits so long for the site's places, as the map-service has them; then those of site.toml count."""
 
 _log = logs.get("planner")
 
@@ -73,6 +79,9 @@ class Riding:
         self._lifts: dict[str, tuple[LiftState, float]] = {}
         self._heard: dict[str, float] = {}
         self._created = clock.now()
+        self._waits: dict[str, tuple[str, float, float]] = {}
+        """By robot: for which place it waits until the site's places are known, since when, and until when at least."""
+        self._giving = asyncio.Lock()
         service.missions.site = site.id
         service.missions.leg_to = self.leg_to
 
@@ -89,11 +98,14 @@ class Riding:
         self._heard[robot] = self._clock.now()
         self._service.missions.said[robot] = state.berth or Berth(floor=self._site.id)
 
-    def leg_to(self, robot: str, stop: Stop, who: str) -> tuple[Stop, Ride | None] | str:
-        """Return where a robot goes for a stop: there, or to the nearest lift to its floor; or why it can't."""
+    def leg_to(self, robot: str, stop: Stop, who: str) -> tuple[Stop, Ride | None] | str | None:
+        """Return where a robot goes for a stop: there, or to the nearest lift to its floor; or why it can't.
+
+        None: that is not known yet.
+        """
         if stop.floor in (None, self._site.id):
-            found = self._resolved(stop)
-            return found if isinstance(found, str) else (found, None)
+            found = self._resolved(robot, stop)
+            return (found, None) if isinstance(found, Stop) else found
         lift = lift_to(self._site.lifts, stop.floor, self._service.poses.get(robot))
         if lift is None:
             known = sorted({floor for each in self._site.lifts for floor in each.floors} - {self._site.id})
@@ -114,6 +126,7 @@ class Riding:
         found = self.leg_to(robot, stop, who)
         if isinstance(found, str):
             raise ProblemError(PlannerProblem.NO_LIFT, found, field=f"{field}.floor")
+        assert found is not None  # who orders a stop here gives its pose
         return found
 
     def check(self, robot: str, stop: Stop, field: str, *, mission: bool) -> None:
@@ -127,16 +140,87 @@ class Riding:
         if (found := cannot_leave(robot, state, stop.floor, mission=mission)) is not None:
             raise ProblemError(found[0], found[1], field=f"{field}.floor")
 
-    def _resolved(self, stop: Stop) -> Stop | str:
-        """Return a stop of this floor with a pose; or, for a place that does not exist, that there is none."""
+    def waits(self, robot: str) -> str:
+        """Return why a robot's mission does not go on here yet; empty if it does, or if it has none."""
+        name, _, until = self._waits.get(robot, ("", 0.0, 0.0))
+        if self._clock.now() <= until:
+            return f"it goes to {name} once the map-service has told this floor's places, {PLACES_S:.0f} s at most"
+        known = self._service.missions.berths.get(robot)
+        given = None if known is None or known.floor != self._site.id else known.came_by
+        if given is None or not carries(given) or session(robot, given.epoch) in self._service.missions.begun:
+            return ""
+        return f"it comes with a mission from {given.origin}, and goes on once the lift {given.lift} is open here"
+
+    def _resolved(self, robot: str, stop: Stop) -> Stop | str | None:
+        """Return a stop of this floor with a pose; None for a place while the places are not known; or why it has none.
+
+        None is returned for a while only.
+        """
         if stop.pose is not None:
             return stop
-        known = self._site.places if self._service.places is None else self._service.places
-        place = known.get(stop.place or "")
+        known, name, now = self._service.places, stop.place or "", self._clock.now()
+        if known is None:
+            before, since, until = self._waits.get(robot, (name, now, now))
+            if before != name or now > until:
+                since = now  # that was another wait, which has ended
+            if now - since < PLACES_S:
+                self._waits[robot] = name, since, now + _SEEN_S
+                return None
+        self._waits.pop(robot, None)
+        place = (self._site.places if known is None else known).get(name)
         if place is None:
-            return f"there is no place {stop.place}"
+            unknown = f", and the map-service has told no others for {PLACES_S:.0f} s" if known is None else ""
+            return f"there is no place {name}{unknown}"
         pose = Pose(x=place.x, y=place.y, theta=place.theta or 0.0)
         return structs.replace(stop, pose=pose, any_heading=place.theta is None)
+
+    async def cancel(self, robot: str, who: str, expected: str | None = None) -> bool:
+        """End a robot's mission, also one that it takes along to another floor; False when it has none.
+
+        Of that no stop is left: the robot finishes its ride, and drives out of the lift. Raises `OnOtherFloorError`
+        for one that only the other floor can cancel, `MissionConflictError` and `StoreError`.
+        """
+        missions, operator = self._service.missions, self._service.operator
+        async with self._giving:  # what is being given to it is in force then
+            if await missions.cancel(robot, who, expected):
+                return True
+            known = missions.berths.get(robot)
+            left = known is not None and known.floor != self._site.id
+            away = operator.heard(robot) is None and (left or (known is None and robot not in missions.said))
+            if expected is None and (away or missions.standing(robot) == "arrives"):
+                coming = self._coming(robot, known, who)
+                if coming is not None:
+                    await missions.cancel_coming(robot, who, coming)
+                    return True
+            if known is None or not carries(known.came_by, expected):
+                return False
+            changed = None if away else await missions.cancel_carried(robot, who, expected)
+            if not left:
+                return changed is not None
+            if changed is not None:
+                try:
+                    if (await operator.hand_over(robot, changed)).code != RefusalCode.OTHER_BERTH:
+                        return True
+                except CommandError as error:
+                    _log.info("ride_not_cancelled", robot=robot, reason=str(error))
+            reason = f"it has left for {known.floor}, and its mission with it: cancel it there"
+            raise OnOtherFloorError(robot, OutOfService(id="floor", reason=reason, by=who, since=0.0))
+
+    def _coming(self, robot: str, known: Berth | None, who: str) -> HandOver | None:
+        """Return the hand-over by which a robot is on its way here, as far as a lift shows that; None if none does."""
+        for lift in self._site.lifts:
+            state = self._lift(lift.id)
+            name, _, number = ("" if state is None else state.session_id).rpartition("/")
+            if state is None or state.destination_floor != self._site.id or name != robot or not number.isdecimal():
+                continue
+            if (epoch := int(number)) > (0 if known is None else known.epoch):
+                others = (floor for floor in lift.floors if floor != self._site.id)
+                origin = next(others) if known is None else known.floor
+                return HandOver(
+                    origin=origin, floor=self._site.id, epoch=epoch, lift=lift.id, goal=OUT, who=who,
+                    id=secrets.token_hex(8),
+                )  # fmt: skip
+        return None
 
     async def run(self) -> None:
         """Let rides go on, twice a second."""
@@ -223,22 +307,37 @@ class Riding:
             lift = self._lift(given.lift)
             if given.lift is not None and (lift is None or not lift.serves(name, self._site.id)):
                 return
-            begun.add(name)
-            if given.goal is not None:
-                try:
-                    await self._send(robot, given, given.goal)
-                except StoreError:
-                    begun.discard(name)
-                    raise
+            async with self._giving:
+                await self._give(robot, name, given)
         if given.lift is None or is_out:
             await self._service.missions.settle(robot)
             begun.discard(name)
 
-    async def _send(self, robot: str, given: HandOver, goal: FloorGoal) -> None:
-        stop = self._resolved(Stop(place=goal.place, pose=goal.pose, any_heading=goal.any_heading))
+    async def _give(self, robot: str, name: str, given: HandOver) -> None:
+        """Give a robot what it goes on with here, unless it was cancelled meanwhile. Raises `StoreError`."""
+        known, goal = self._service.missions.berths.get(robot), given.goal
+        if known is None or known.came_by != given:
+            return
+        stop: Stop | str | None = None
+        if goal == OUT:
+            waits = (lift.wait for lift in self._site.lifts if lift.id == given.lift)
+            stop = next((Stop(pose=pose, any_heading=True) for pose in waits), "its lift is not this floor's")
+        elif goal is not None:
+            stop = self._resolved(robot, Stop(place=goal.place, pose=goal.pose, any_heading=goal.any_heading))
+            if stop is None:
+                return  # it is tried again
+        begun = self._service.missions.begun
+        begun.add(name)
         if isinstance(stop, str):
             _log.warning("ride_without_goal", robot=robot, reason=stop)
-            return
+        elif stop is not None:
+            try:
+                await self._send(robot, given, stop)
+            except StoreError:
+                begun.discard(name)
+                raise
+
+    async def _send(self, robot: str, given: HandOver, stop: Stop) -> None:
         assert stop.pose is not None  # it is resolved
         attempt = Attempt.of("floors", given.id or session(robot, given.epoch), "arrival", given)
         order = Order(

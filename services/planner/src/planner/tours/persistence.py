@@ -66,6 +66,7 @@ class MissionPersistence:
         self._reload = True
         self._leading = False
         self._reached: dict[str, str] = {}
+        self._undecided: dict[str, str] = {}  # reached goals of missions of which it is not known yet where they go on
         self.goals: dict[str, StoredGoal] = {}
         """The missions by robot."""
         self._out: dict[str, OutOfService] = {}

@@ -297,6 +297,7 @@ async def test_mission_that_is_cancelled_ends_wherever_the_robot_is_then_and_doe
     told = building.told[-1]
     for floor in building.floors.values():
         await floor.start()
+        await floor.step()  # before it hears of the robot
     await building.go_on()
     assert (building.told[-1], await building.stored()) == (told, [])
     assert (building.lift.session == "") == (building.at != CABIN), "it is held for a robot that is in it"

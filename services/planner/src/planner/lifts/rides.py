@@ -117,10 +117,14 @@ def lift_to(lifts: Iterable[LiftSite], floor: str, pose: RobotPose | None) -> Li
 
 
 def cabins_at(lifts: Iterable[LiftSite], berth: Berth, pose: RobotPose | None) -> frozenset[str]:
-    """Return the lifts in whose cabin or door a robot may be: by its pose or, while that is unknown, by its ride."""
+    """Return the lifts in whose cabin or door a robot may be: by its pose or, while that is unknown, by its ride.
+
+    Without a ride it may be in each of them as long as nothing was heard of it.
+    """
     if pose is None or not pose.localized:
-        lift = berth.came_by.lift if berth.came_by is not None else None
-        return frozenset() if lift is None else frozenset((lift,))
+        if berth.came_by is not None:
+            return frozenset() if berth.came_by.lift is None else frozenset((berth.came_by.lift,))
+        return frozenset(lift.id for lift in lifts) if pose is None else frozenset()
     return frozenset(lift.id for lift in lifts if _may_be_in(lift, pose))
 
 

@@ -102,6 +102,13 @@ def test_normals_are_those_of_the_walls_and_none_at_what_is_no_line():
     assert (normals(10.0 * scattered, 0.01) == 0.0).all()
 
 
+def test_normals_beside_a_step_of_a_wall_are_those_of_the_wall():
+    bearings = np.radians(np.arange(30.0, 150.0))
+    away = np.where(1.0 / np.tan(bearings) < 0.4, 1.0, 1.1)  # m; the wall to the left of a robot, with a shallow niche
+    points = np.column_stack((away / np.tan(bearings), away))
+    assert np.abs(normals(points, 0.4)[:, 1]).min() > math.cos(math.radians(0.5))
+
+
 def test_each_scan_counts_once_in_a_cell_as_hit_if_any_beam_ends_there():
     counts = BeamCounts((20, 40), 0.05, 0.0, 0.0)
     ends = np.array(((1.52, 0.52), (1.53, 0.53), (1.52, 0.77)))

@@ -12,8 +12,8 @@ from fog_contracts.costs import FREE, LETHAL
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.raycast import cast
 from fog_mapping.building import draw, find_trajectory
-from fog_mapping.loops import LoopSearch, _neighbours
-from fog_mapping.poses import Edge, between, compose, place
+from fog_mapping.loops import LoopSearch
+from fog_mapping.poses import between, compose, place
 from fog_mapping.relations import absolute_error, relation_errors, scans_fit
 from fog_mapping.scans import Scan, keep_moved, scan_of
 from fog_mapping.trajectory import _AROUND, _Cells, match_in_order, refuse_mirrored
@@ -89,9 +89,15 @@ def mapped():
 
 
 def drawn(scans: list[Scan], poses: np.ndarray, truth: np.ndarray, value: int) -> np.ndarray:
-    """Return the centres of the map's cells with a value, in the frame of the building."""
+    """Return the centres of the map's cells with a value, laid on the building as the whole way fits best.
+
+    The map lies as its first scan does, some thousandths of a radian off: that is not in its walls.
+    """
     built = draw(((pose, scan.points) for pose, scan in zip(poses, scans, strict=True)), CELL)
-    origin = compose(truth[0], between(poses[0], np.zeros(3)))
+    found, true = poses[:, :2] @ (1.0, 1.0j), truth[:, :2] @ (1.0, 1.0j)
+    turn = np.angle(np.vdot(found - found.mean(), true - true.mean()))
+    shift = true.mean() - np.exp(1.0j * turn) * found.mean()
+    origin = np.array((shift.real, shift.imag, turn))
     return place(origin, built.geometry.centres(np.argwhere(built.cells == value)[:, ::-1].astype(np.int64)))
 
 
@@ -276,21 +282,6 @@ def test_scans_lie_on_each_other_best_where_they_were_taken_and_tell_how_far_off
     assert true.off_m < 0.015
     assert 0.03 < wrong.off_m < 0.08
     assert true.off_deg < 0.3 < wrong.off_deg
-
-
-def test_a_way_of_many_scans_between_joints_makes_as_uncertain_as_each_of_its_steps():
-    rng = np.random.default_rng(1)
-    joints = np.array([0, 7, 12, 13, 20, 29])
-    ends = [(i, i + 1) for i in range(29)] + [(0, 20), (29, 12)]
-    edges = [
-        Edge(first, second, rng.uniform(-0.5, 0.5, 3), np.diag(rng.uniform(50.0, 900.0, 3)), second != first + 1)
-        for first, second in ends
-    ]
-    for number, joint in enumerate(joints):
-        each = _neighbours(np.arange(30), edges, np.ones(len(edges))).seen_from(int(joint))
-        joined = _neighbours(joints, edges, np.ones(len(edges))).seen_from(number)
-        for one, other in zip(each, joined, strict=True):
-            assert other == pytest.approx(one[joints])
 
 
 def test_the_scans_around_one_are_the_nearest_of_all_wherever_they_have_moved():

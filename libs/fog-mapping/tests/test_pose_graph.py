@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fog_mapping.pose_graph import solve
+from fog_mapping.pose_graph import Certainty, solve
 from fog_mapping.poses import Edge, between, compose
 
 SIGMAS = np.array((0.02, 0.02, 0.006))
@@ -70,6 +70,33 @@ def test_exact_measurements_give_exact_poses():
     edges = [Edge(i - 1, i, between(truth[i - 1], truth[i]), INFORMATION) for i in range(1, 60)]
     found = solve(truth + 0.01 * np.sin(np.arange(180.0)).reshape(60, 3) * (np.arange(60) > 0)[:, None], edges)
     assert np.abs(found.poses - truth).max() < 1e-6
+
+
+def test_a_heading_that_is_off_makes_what_follows_uncertain_by_the_whole_way_to_it():
+    way = np.array([(0.5 * i, 0.0, 0.0) for i in range(201)])
+    edges = [Edge(i, i + 1, np.array((0.5, 0.0, 0.0)), np.diag((1e4, 1e4, 1e6))) for i in range(200)]
+    seen = Certainty(way, np.array((0, 50, 200)), edges, np.ones(200)).seen_from(np.array((0, 2)))
+    levers = 0.5 * np.arange(200)
+    assert seen[0, 2] == pytest.approx(np.diag((0.02, 0.02, 2e-4)) + np.array((
+        (0.0, 0.0, 0.0), (0.0, (1e-6 * levers**2).sum(), (1e-6 * levers).sum()), (0.0, (1e-6 * levers).sum(), 0.0)
+    )), rel=1e-3, abs=1e-9)  # fmt: skip
+    assert seen[1, 0, 1, 1] == pytest.approx(seen[0, 2, 1, 1], rel=0.02), "as seen from its end, the whole way lies off"
+    assert seen[0, 0] == pytest.approx(np.zeros((3, 3)), abs=1e-9)
+
+
+def test_a_way_of_many_scans_between_joints_makes_as_uncertain_as_all_its_steps_and_a_loop_less_so():
+    rng, truth, joints = np.random.default_rng(1), rounds(60), np.array((0, 7, 12, 13, 20, 48, 59))
+    ends = [(i, i + 1) for i in range(59)] + [(0, 20), (48, 12)]
+    edges = []
+    for first, second in ends:
+        root = rng.normal(size=(3, 3))
+        edges.append(Edge(first, second, np.zeros(3), root @ root.T + np.eye(3) * 50.0, second != first + 1))
+    weights = np.append(np.ones(60), 0.4)
+    joined = Certainty(truth, joints, edges, weights).seen_from(np.arange(7))
+    each = Certainty(truth, np.arange(60), edges, weights).seen_from(joints)
+    assert joined == pytest.approx(each[:, joints], rel=1e-6, abs=1e-9)
+    open_way = Certainty(truth, joints, edges[:59], weights[:59]).seen_from(np.arange(7))
+    assert joined[4, 0].trace() < 0.5 * open_way[4, 0].trace()
 
 
 def test_pose_that_nothing_reaches_is_an_error():

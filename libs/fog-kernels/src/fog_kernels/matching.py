@@ -33,6 +33,9 @@ _MARGIN_M: Final = 1.0
 _NEIGHBOURS: Final = 10
 _STRAIGHT: Final = 0.1
 """Points lie on a line if they spread across it by less than this share (of variance) of what they spread along it."""
+_CLEARER: Final = 2.0
+"""A line of the points to one side that spread across it by so much less (variance) is the wall before a step. A line
+over the step is tilted, and lies the farther on, the farther off it is seen from: the way past it becomes too long."""
 _PARALLEL: Final = 0.8
 """Cosine of the angle up to which the lines of two points may be one wall."""
 _CAUCHY: Final = 3.0
@@ -75,33 +78,51 @@ class Excluded(NamedTuple):
     angle: float
 
 
+_line_signature = types.UniTuple(float64, 4)(  # type: ignore[no-untyped-call]  # numba has no types
+    _arrays.F64_GRID, int64, int64, int64, float64
+)  # fmt: skip
+
+
+@njit(_line_signature, cache=True, nogil=True)
+def _line(points: Any, i: int, first: int, end: int, reach: float) -> Any:
+    """Return the line of the points `first` to `end` that are within `reach` of point `i`.
+
+    How many they are, the sums of their squared distances across and along it (m²), and its direction (rad).
+    """
+    sum_x = sum_y = xx = xy = yy = 0.0
+    joined = 0
+    for j in range(max(0, first), min(points.shape[0], end)):
+        dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+        if math.hypot(dx, dy) > reach:
+            continue
+        sum_x += dx
+        sum_y += dy
+        xx += dx * dx
+        xy += dx * dy
+        yy += dy * dy
+        joined += 1
+    xx -= sum_x * sum_x / joined
+    xy -= sum_x * sum_y / joined
+    yy -= sum_y * sum_y / joined
+    root = math.sqrt(max(0.0, 0.25 * (xx - yy) ** 2 + xy * xy))
+    return float(joined), 0.5 * (xx + yy) - root, 0.5 * (xx + yy) + root, 0.5 * math.atan2(2.0 * xy, xx - yy)
+
+
 @njit(void(_arrays.F64_GRID, float64, _F64_GRID_OUT), cache=True, nogil=True)
 def _normals(points: Any, reach: float, out: Any) -> None:
-    count = points.shape[0]
-    for i in range(count):
-        sum_x = sum_y = xx = xy = yy = 0.0
-        joined = 0
-        for j in range(max(0, i - _NEIGHBOURS), min(count, i + _NEIGHBOURS + 1)):
-            dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
-            if math.hypot(dx, dy) > reach:
-                continue
-            sum_x += dx
-            sum_y += dy
-            xx += dx * dx
-            xy += dx * dy
-            yy += dy * dy
-            joined += 1
+    for i in range(points.shape[0]):
         out[i, 0] = out[i, 1] = 0.0
-        if joined < 3:
+        joined, across, along, angle = _line(points, i, i - _NEIGHBOURS, i + _NEIGHBOURS + 1, reach)
+        if joined < 3.0:
             continue
-        xx -= sum_x * sum_x / joined
-        xy -= sum_x * sum_y / joined
-        yy -= sum_y * sum_y / joined
-        root = math.sqrt(max(0.0, 0.25 * (xx - yy) ** 2 + xy * xy))
-        across, along = 0.5 * (xx + yy) - root, 0.5 * (xx + yy) + root
+        spread = across / (joined - 2.0)
+        for first in (i - _NEIGHBOURS, i):
+            side, side_across, side_along, side_angle = _line(points, i, first, first + _NEIGHBOURS + 1, reach)
+            if side >= _NEIGHBOURS and _CLEARER * side_across / (side - 2.0) < spread:
+                spread = _CLEARER * side_across / (side - 2.0)
+                across, along, angle = side_across, side_along, side_angle
         if along <= 0.0 or across > _STRAIGHT * along:
             continue
-        angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
         out[i, 0], out[i, 1] = -math.sin(angle), math.cos(angle)
 
 
@@ -145,8 +166,8 @@ def _sum_at(tables: Any, level: int, cells: Any, angle: int, dx: int, dy: int) -
 
 @njit(
     int64(
-        _TABLES, _arrays.F64_GRID, float64, float64, float64, float64, _arrays.F64_FLAT, float64, float64, float64,
-        float64, float64, _arrays.F64_FLAT, _arrays.I64_OUT,
+        _TABLES, _arrays.F64_GRID, float64, float64, float64, float64, float64, _arrays.F64_FLAT, float64, float64,
+        float64, float64, float64, _arrays.F64_FLAT, _arrays.I64_OUT,
     ),
     cache=True,
     nogil=True,
@@ -157,7 +178,8 @@ def _search(
     x0: float,
     y0: float,
     theta0: float,
-    half: float,
+    half_x: float,
+    half_y: float,
     turns: Any,
     resolution: float,
     left: float,
@@ -175,14 +197,14 @@ def _search(
         for i in range(count):
             cells[a, i] = math.floor((x0 + cos * points[i, 0] - sin * points[i, 1] - left) / resolution)
             cells[a, count + i] = math.floor((y0 + sin * points[i, 0] + cos * points[i, 1] - bottom) / resolution)
-    reach, top = math.ceil(half / resolution), tables.shape[0] - 1
+    reach_x, reach_y, top = math.ceil(half_x / resolution), math.ceil(half_y / resolution), tables.shape[0] - 1
     step = 1 << top
-    blocks = (2 * reach) // step + 1
-    bounds = np.empty(angles * blocks * blocks, np.int64)
+    across, blocks = (2 * reach_x) // step + 1, ((2 * reach_x) // step + 1) * ((2 * reach_y) // step + 1)
+    bounds = np.empty(angles * blocks, np.int64)
     for block in range(bounds.size):
-        a, rest = block // (blocks * blocks), block % (blocks * blocks)
+        a, rest = block // blocks, block % blocks
         bounds[block] = _sum_at(
-            tables, top, cells, a, -reach + (rest % blocks) * step, -reach + (rest // blocks) * step
+            tables, top, cells, a, -reach_x + (rest % across) * step, -reach_y + (rest // across) * step
         )
     best = math.floor(least * count)
     found = -1
@@ -191,22 +213,23 @@ def _search(
     for block in np.argsort(-bounds, kind="mergesort"):
         if bounds[block] <= best:
             break
-        rest = block % (blocks * blocks)
-        stack[0, 0], stack[0, 1], stack[0, 4] = top, block // (blocks * blocks), bounds[block]
-        stack[0, 2], stack[0, 3] = -reach + (rest % blocks) * step, -reach + (rest // blocks) * step
+        rest = block % blocks
+        stack[0, 0], stack[0, 1], stack[0, 4] = top, block // blocks, bounds[block]
+        stack[0, 2], stack[0, 3] = -reach_x + (rest % across) * step, -reach_y + (rest // across) * step
         waiting = 1
         while waiting > 0:
             waiting -= 1
             level, a, bound = stack[waiting, 0], stack[waiting, 1], stack[waiting, 4]
             dx, dy = stack[waiting, 2], stack[waiting, 3]
-            if bound <= best or dx > reach or dy > reach:  # the last blocks reach beyond what is searched
+            if bound <= best or dx > reach_x or dy > reach_y:  # the last blocks reach beyond what is searched
                 continue
             if level == 0:
                 turned = (theta0 + turns[a] - excluded[2] + math.pi) % (2.0 * math.pi) - math.pi
                 away = math.hypot(x0 + dx * resolution - excluded[0], y0 + dy * resolution - excluded[1])
                 if away <= excluded[3] and abs(turned) <= excluded[4]:
                     continue
-                value = bound - math.floor(doubt * count * (dx * dx + dy * dy) / max(1, reach * reach))
+                away = dx * dx / max(1, reach_x * reach_x) + dy * dy / max(1, reach_y * reach_y)
+                value = bound - math.floor(doubt * count * away)
                 if value > best:
                     best = found = value
                     best_at[0], best_at[1], best_at[2] = dx, dy, a
@@ -384,7 +407,8 @@ _NOTHING_EXCLUDED: Final = np.array((0.0, 0.0, 0.0, -1.0, -1.0))
 def normals(points: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
     """Return for each point (n, 2; m; in the order of their bearings) the unit normal of the line that it lies on.
 
-    The line is that of up to ten points to both sides, `reach` (m) away at most; zeros: there is none.
+    The line is that of up to ten points to both sides, `reach` (m) away at most, or to one where the wall has a step;
+    zeros: there is none.
     """
     out = np.empty_like(points)
     _normals(np.ascontiguousarray(points), reach, out)
@@ -413,7 +437,7 @@ class Reference:
         self,
         points: NDArray[np.float64],
         guess: tuple[float, float, float],
-        half: float,
+        half: float | tuple[float, float],
         half_turn: float,
         turn: float,
         least: float,
@@ -422,20 +446,21 @@ class Reference:
     ) -> Found | None:
         """Return the best pose of a scan's points (n, 2; m) near a guess; None if none has a score above `least`.
 
-        Poses are looked at up to `half` (m) away along both axes, by cells, and turned by `half_turn` (rad) at most, in
-        steps of `turn`. doubt: what a pose loses of its score `half` away, nearer by the square of the distance: where
-        several fit alike, as along a corridor, the guess is believed.
+        Poses are looked at up to `half` (m; or one for each axis) away, by cells, and turned by `half_turn` (rad) at
+        most, in steps of `turn`. doubt: what a pose loses of its score `half` away, nearer by the square of the
+        distance: where several fit alike, as along a corridor, the guess is believed.
         """
         if self._tables is None:
             self._tables = self._blurred()
+        half_x, half_y = half if isinstance(half, tuple) else (half, half)
         steps = math.ceil(half_turn / turn)
         turns = np.arange(-steps, steps + 1) * turn
         left, bottom = self._left - _PAD * self._resolution, self._bottom - _PAD * self._resolution
         without = _NOTHING_EXCLUDED if excluded is None else np.array((*excluded.pose, excluded.radius, excluded.angle))
         at = np.zeros(3, np.int64)
         total = _search(
-            self._tables, points, *guess, half, turns, self._resolution, left, bottom, 255.0 * least, 255.0 * doubt,
-            without, at,
+            self._tables, points, *guess, half_x, half_y, turns, self._resolution, left, bottom, 255.0 * least,
+            255.0 * doubt, without, at,
         )  # fmt: skip
         if total < 0:
             return None

@@ -54,11 +54,10 @@ PROFILES: dict[str, tuple[str, ...]] = {
     ),
     "map": ("components", "distance", "inflation", "raycast"),
     "sim": ("distance", "emulation", "raycast"),
-    "mapping": ("certainty", "matching"),
+    "mapping": ("matching",),
     "all": (
         "amcl",
         "astar",
-        "certainty",
         "clearance",
         "components",
         "course",

@@ -9,7 +9,7 @@ import numpy as np
 
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_kernels.matching import BeamCounts
-from fog_mapping.loops import LoopSearch
+from fog_mapping.loops import LoopSearch, Searched
 from fog_mapping.pose_graph import solve
 from fog_mapping.poses import place
 from fog_mapping.trajectory import against_odometry, match_in_order, refuse_mirrored, settle
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fog_mapping.scans import Scan
     from fog_mapping.trajectory import AgainstOdometry
 
-_CERTAIN_M: Final = (2.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+_CERTAIN_M: Final = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 64.0)
 """What is certain to so much (m) is looked for, round by round."""
 _MARGIN_M: Final = 1.0
 _MAX_CELLS: Final = 40_000_000
@@ -60,19 +60,16 @@ def find_trajectory(
     poses, edges = match_in_order(scans, lambda done: on_progress("matching scans", done / len(scans)))
     against, weights = against_odometry(scans, edges), np.ones(len(edges))
     search = LoopSearch(scans, poses, without, jobs)
-    loops: list[Loop] = []
-    ambiguous = 0
+    way, found = list(edges), Searched([], [], 0, changed=False)
     for number, most in enumerate(_CERTAIN_M):
         what = f"looking for loops, round {number + 1}"
         found = search.search(poses, edges, weights, most, partial(on_progress, what))
-        loops.extend(found.loops)
-        edges.extend(found.edges)
-        ambiguous += found.ambiguous
-        if found.edges:
+        edges = way + found.edges
+        if found.changed:
             poses, weights, _ = solve(poses, edges)
     poses = settle(scans, poses)
-    counted = weights[len(edges) - len(loops) :] if loops else weights[:0]
-    return Trajectory(poses, list(zip(loops, counted.tolist(), strict=True)), ambiguous, against)
+    counted = weights[len(way) :].tolist()
+    return Trajectory(poses, list(zip(found.loops, counted, strict=True)), found.ambiguous, against)
 
 
 def draw(rays: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], resolution: float) -> StaticMap:

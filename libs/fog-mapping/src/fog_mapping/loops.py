@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from fog_kernels.certainty import Neighbours
 from fog_kernels.matching import Excluded
+from fog_mapping.pose_graph import Certainty
 from fog_mapping.poses import Edge, between, path_lengths
 from fog_mapping.scans import cloud, reference_of, thinned
 from fog_mapping.trajectory import GATES, independent
@@ -26,17 +26,22 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from fog_kernels.matching import Reference
     from fog_mapping.scans import Scan
 
 _PLACE_EVERY_M: Final = 5.0
 _PLACE_HALF_M: Final = 5.0
+_MOST_AROUND_M: Final = 9.5
+"""How much of the way to either side of a place counts at most where a stretch is looked for far from it."""
 _STRETCH_EVERY_M: Final = 2.5
 _STRETCH_HALF_M: Final = 2.5
 _LEAST_WAY_M: Final = 12.0
-"""Two stretches of the way must be so far apart along it to be a loop, between their middles."""
+"""Two stretches of the way must be so far apart along it to be a loop, between their middles: no scan is in both."""
 _NEAR_M: Final = 3.0
 _SIGMAS: Final = 3.0
 _LEAST_M: Final = 0.5
+_LEAST_SIGMA_M: Final = 0.03
+"""What a place and a stretch show is not known better than that."""
 _LEAST_RAD: Final = math.radians(5.0)
 _MOST_RAD: Final = math.radians(40.0)
 _TURN_STEP: Final = math.radians(1.0)
@@ -54,6 +59,7 @@ _REPEATED: Final = 0.7
 _MOST_TRIED: Final = 8
 """So many stretches, the nearest ones, are looked for at a place in a round: a robot that drives its rounds for hours
 comes to each place again and again, and each time joined to each other would take the square of the time."""
+_PLACES_AT_ONCE: Final = 64
 _COUNTS: Final = 0.5
 """A loop that counts less than this contradicts the rest."""
 _KEPT: Final = 0.3
@@ -125,11 +131,22 @@ def _ends(loop: Loop) -> tuple[int, int]:
 
 
 class Searched(NamedTuple):
-    """What was found: edges with the loops that they are, and how many pairs fitted several places."""
+    """What is found by now: edges with the loops that they are, and how many pairs fit several places.
+
+    changed: whether this round has found or given up any.
+    """
 
     edges: list[Edge]
     loops: list[Loop]
     ambiguous: int
+    changed: bool
+
+
+class _Match(NamedTuple):
+    """What a place and a stretch have shown: a loop, or none, as the stretch fits nowhere or at `several` places."""
+
+    found: tuple[Edge, Loop] | None
+    several: bool = False
 
 
 class LoopSearch:
@@ -147,6 +164,7 @@ class LoopSearch:
         self._joints = np.unique([0, len(scans) - 1, *(one.middle for one in (*self._places, *self._queries))])
         self._without = [(self._way[first], self._way[second]) for first, second in without]
         self._tried: dict[tuple[int, int], float] = {}
+        self._found: dict[tuple[int, int], _Match] = {}
         self._jobs = jobs
 
     def search(
@@ -158,88 +176,109 @@ class LoopSearch:
         on_progress: Callable[[float], object] = lambda _: None,
     ) -> Searched:
         """Look for what may be a loop and is certain to `most` (m); the same for the same arguments."""
-        neighbours = _neighbours(self._joints, edges, weights)
-        joined: list[Edge] = []
-        loops: list[Loop] = []
-        ambiguous = 0
+        counted = [k for k, edge in enumerate(edges) if not edge.loop or weights[k] >= _KEPT]
+        certainty = Certainty(poses, self._joints, [edges[k] for k in counted], weights[counted])
+        joints = np.searchsorted(self._joints, [place.middle for place in self._places])
+        changed = False
         with ThreadPoolExecutor(self._jobs) as pool:
-            places = pool.map(partial(self._search_place, poses, neighbours, most), range(len(self._places)))
-            for done, found in enumerate(places, 1):
-                joined.extend(found.edges)
-                loops.extend(found.loops)
-                ambiguous += found.ambiguous
-                on_progress(done / len(self._places))
-        return Searched(joined, loops, ambiguous)
+            for start in range(0, len(self._places), _PLACES_AT_ONCE):
+                seen = certainty.seen_from(joints[start : start + _PLACES_AT_ONCE])
+                some = range(start, start + len(seen))
+                places = pool.map(partial(self._search_place, poses, most), some, seen)
+                for number, found in zip(some, places, strict=True):
+                    for index, match in found.items():
+                        # What was found when less was certain may have been something else that looks like it.
+                        before = self._found.get((number, index), _Match(None))
+                        changed |= (match.found or before.found) is not None
+                        self._found[number, index] = match
+                    on_progress((number + 1) / len(self._places))
+        kept = [match.found for match in self._found.values() if match.found is not None]
+        ambiguous = sum(match.several for match in self._found.values())
+        return Searched([edge for edge, _ in kept], [loop for _, loop in kept], ambiguous, changed)
 
-    def _search_place(self, poses: NDArray[np.float64], neighbours: Neighbours, most: float, number: int) -> Searched:
+    def _search_place(
+        self, poses: NDArray[np.float64], most: float, number: int, seen: NDArray[np.float64]
+    ) -> dict[int, _Match]:
+        """Return what each stretch that was looked for at a place has shown."""
         place = self._places[number]
-        joint = int(np.searchsorted(self._joints, place.middle))
-        known = neighbours.seen_from(joint, (most / _SIGMAS) ** 2 * (1.0 + 1e-9))
-        wanted = list(itertools.islice(self._candidates(number, poses, *known, most), _MOST_TRIED))
-        for index, half, _ in wanted:
-            self._tried[number, index] = half
-        edges: list[Edge] = []
-        loops: list[Loop] = []
-        ambiguous = 0
+        wanted = list(itertools.islice(self._candidates(number, poses, seen, most), _MOST_TRIED))
         if not wanted:
-            return Searched(edges, loops, ambiguous)
-        reference = reference_of(self._scans, poses, range(place.first, place.last + 1), poses[place.middle])
-        for index, half, half_turn in wanted:
-            query = self._queries[index]
-            points, lines = thinned(
-                *cloud(self._scans, poses, range(query.first, query.last + 1), poses[query.middle]), _THIN_M
-            )
-            guess = tuple(between(poses[place.middle], poses[query.middle]))
-            best = reference.search(points, guess, half, half_turn, _TURN_STEP, _LEAST_SCORE)
-            if best is None:
-                continue
-            fit = reference.align(points, lines, best.pose, best.pose, np.eye(3), GATES)
-            if fit.share < _LEAST_SHARE or fit.residual > _MOST_RESIDUAL_M:
-                continue
-            information = independent(fit.information)
-            other = reference.search(
-                points, guess, half, half_turn, _TURN_STEP, _ALIKE * best.score,
-                Excluded(best.pose, _SAME_M, _SAME_RAD),
-            )  # fmt: skip
-            step = np.array(fit.pose)
-            if other is not None:
-                off = between(step, np.array(other.pose))
-                if off @ information @ off > _EXPLAINED:
-                    ambiguous += 1
-                    continue
-            edges.append(Edge(place.middle, query.middle, step, information + _FLOOR * np.eye(3), loop=True))
-            loops.append(Loop(place.middle, query.middle, best.score, fit.share, fit.residual))
-        return Searched(edges, loops, ambiguous)
+            return {}
+        # Wherever a stretch is looked for, all of it must have something to be like. Else, of a row of equal doors,
+        # that in the middle of the place would win against the right one at its end.
+        reach = min(_MOST_AROUND_M, _PLACE_HALF_M + max(max(half) for _, half, _ in wanted))
+        reference = reference_of(self._scans, poses, self._around(place.middle, reach), poses[place.middle])
+        return {
+            index: self._match(reference, poses, place.middle, self._queries[index].middle, half, half_turn)
+            for index, half, half_turn in wanted
+        }
+
+    def _match(
+        self,
+        reference: Reference,
+        poses: NDArray[np.float64],
+        first: int,
+        second: int,
+        half: tuple[float, float],
+        half_turn: float,
+    ) -> _Match:
+        points, lines = thinned(
+            *cloud(self._scans, poses, self._around(second, _STRETCH_HALF_M), poses[second]), _THIN_M
+        )
+        guess = tuple(between(poses[first], poses[second]))
+        best = reference.search(points, guess, half, half_turn, _TURN_STEP, _LEAST_SCORE)
+        if best is None:
+            return _Match(None)
+        fit = reference.align(points, lines, best.pose, best.pose, np.eye(3), GATES)
+        if fit.share < _LEAST_SHARE or fit.residual > _MOST_RESIDUAL_M:
+            return _Match(None)
+        step, information = np.array(fit.pose), independent(fit.information)
+        excluded = Excluded(best.pose, _SAME_M, _SAME_RAD)
+        other = reference.search(points, guess, half, half_turn, _TURN_STEP, _ALIKE * best.score, excluded)
+        if other is not None:
+            off = between(step, np.array(other.pose))
+            if off @ information @ off > _EXPLAINED:
+                return _Match(None, several=True)
+        edge = Edge(first, second, step, information + _FLOOR * np.eye(3), loop=True)
+        return _Match((edge, Loop(first, second, best.score, fit.share, fit.residual)))
+
+    def _around(self, middle: int, reach: float) -> list[int]:
+        """Return the scans up to so far (m) from one along the way, none from beyond a break of the odometry."""
+        near = np.flatnonzero(np.abs(self._way - self._way[middle]) <= reach)
+        return [i for i in near.tolist() if self._scans[i].stretch == self._scans[middle].stretch]
 
     def _candidates(
-        self,
-        number: int,
-        poses: NDArray[np.float64],
-        variance: NDArray[np.float64],
-        turn_variance: NDArray[np.float64],
-        most: float,
-    ) -> Iterator[tuple[int, float, float]]:
+        self, number: int, poses: NDArray[np.float64], seen: NDArray[np.float64], most: float
+    ) -> Iterator[tuple[int, tuple[float, float], float]]:
         """Yield the stretches that may be at a place, the nearest first: number, how far and turned to look.
 
-        variance, turn_variance: of the joints.
+        seen: the covariances (joints, 3, 3) of the joints as seen from the place.
         """
         place = self._places[number]
         middles, first, last = self._ends.T
-        joints = np.searchsorted(self._joints, middles)
-        off = _SIGMAS * np.sqrt(variance[joints])
-        away = np.hypot(*(poses[middles, :2] - poses[place.middle, :2]).T)
+        covariance = seen[np.searchsorted(self._joints, middles)]
+        step = between(poses[place.middle], poses[middles])[:, :2]
+        away = np.hypot(*step.T)
+        # What is nearer than that is seen from the place.
+        beyond = step * np.maximum(0.0, 1.0 - _NEAR_M / np.maximum(away, 1e-9))[:, None]
+        spread = covariance[:, :2, :2] + _LEAST_SIGMA_M**2 * np.eye(2)
+        squares = np.einsum("ni,ni->n", beyond, np.linalg.solve(spread, beyond[:, :, None])[:, :, 0])
+        off = _SIGMAS * np.sqrt(np.trace(spread, axis1=1, axis2=2))
         apart = (first > place.last) | (place.first > last)
         apart &= np.abs(self._way[middles] - self._way[place.middle]) >= _LEAST_WAY_M
-        near = np.flatnonzero(apart & (off <= most) & (away <= _NEAR_M + off))
+        near = np.flatnonzero(apart & (off <= most) & (squares <= _SIGMAS**2))
         for index in near[np.argsort(away[near], kind="stable")].tolist():
-            half = max(_LEAST_M, float(off[index]))
             # Looked for again once it is clearly more certain where.
-            if half >= _REPEATED * self._tried.get((number, index), math.inf):
+            if max(_LEAST_M, off[index]) >= _REPEATED * self._tried.get((number, index), math.inf):
                 continue
             query = self._queries[index]
             if not self._is_refused(place, query):
-                turn = _SIGMAS * math.sqrt(turn_variance[joints[index]])
-                yield index, half, min(max(_LEAST_RAD, turn), _MOST_RAD)
+                self._tried[number, index] = max(_LEAST_M, float(off[index]))
+                half_x, half_y, turn = _SIGMAS * np.sqrt(np.diagonal(covariance[index]).clip(0.0))
+                yield (
+                    index, (max(_LEAST_M, float(half_x)), max(_LEAST_M, float(half_y))),
+                    min(max(_LEAST_RAD, float(turn)), _MOST_RAD),
+                )  # fmt: skip
 
     def _is_refused(self, place: Stretch, query: Stretch) -> bool:
         ends = sorted((self._way[place.middle], self._way[query.middle]))
@@ -254,30 +293,3 @@ def _stretches(way: NDArray[np.float64], every: float, half: float) -> Iterator[
         inside = np.nonzero(np.abs(way - at) <= half)[0]
         if len(inside) >= 3:
             yield Stretch(int(np.argmin(np.abs(way - at))), int(inside[0]), int(inside[-1]))
-
-
-def _neighbours(joints: NDArray[np.int64], edges: Sequence[Edge], weights: NDArray[np.float64]) -> Neighbours:
-    """Return how certain the joints are as seen from one another; all ends of loops are joints.
-
-    The way of many scans between two joints, which nothing else meets, counts as one step.
-    """
-    used = [edge for edge, weight in zip(edges, weights, strict=True) if not (edge.loop and weight < _KEPT)]
-    covariance = np.linalg.inv(np.array([edge.information for edge in used]) + 1e-6 * np.eye(3))
-    steps = np.array([edge.step for edge in used])
-    square = steps[:, 0] ** 2 + steps[:, 1] ** 2
-    # The way's edges come first, one from each scan to the next: what turns up to there add at the lever of each step.
-    last, turn = int(joints[-1]), covariance[:, 2, 2]
-    turned = np.concatenate(((0.0,), np.cumsum(turn[:last])))
-    begin, end = (np.repeat(turned[some], np.diff(joints)) for some in (joints[:-1], joints[1:]))
-    onward, back = turn.copy(), turn.copy()
-    onward[:last], back[:last] = turned[1:] - begin, end - turned[:-1]
-    added = (covariance[:, 0, 0] + covariance[:, 1, 1])[:, None] + np.column_stack((onward, back)) * square[:, None]
-    figures = np.column_stack((added, turn, square))
-    way = np.add.reduceat(figures[:last], joints[:-1], axis=0)
-    numbers = np.arange(len(joints))
-    loops = np.searchsorted(joints, [(edge.first, edge.second) for edge in used[last:]]).reshape(-1, 2)
-    return Neighbours(
-        len(joints),
-        np.concatenate((np.column_stack((numbers[:-1], numbers[1:])), loops)),
-        np.concatenate((way, figures[last:])),
-    )

@@ -25,7 +25,7 @@ GATES: Final = np.array([0.45] * 3 + [0.3] * 3 + [0.2] * 4 + [0.12] * 5)
 """How far (m) the line of a point may be, step by step of a refinement."""
 _INDEPENDENT: Final = 0.1
 """The returns of a scan err together (a lidar's bias, a wall that is not straight): so much of them is independent."""
-_SPURIOUS: Final = 0.02
+_SPURIOUS: Final = 0.01
 """Normals err by some degrees, so that plain walls seem to say this share of what they say across also along."""
 WINDOW: Final = 12
 """Scans before it that one is matched to."""
@@ -39,7 +39,7 @@ _SEARCHED_SIGMAS: Final = 2.5
 _MOST_M: Final = 0.6
 _MOST_RAD: Final = 0.5
 _DOUBT: Final = 0.05
-_BREAK_M: Final = 1.0
+_BREAK_M: Final = 2.0
 _BREAK_RAD: Final = 0.5
 """Deviations of the odometry over a break of it: of a robot that somebody drove on for some seconds."""
 _CLEAR_TURN_RAD: Final = 0.12

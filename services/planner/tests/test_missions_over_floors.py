@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import random
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,6 +14,7 @@ from manual_clock import ManualClock
 
 from fog_contracts.handover import next_berth
 from fog_contracts.messages import Berth, CommandReply, Place, PlanReply, Pose, Reason, RobotPose, RobotState
+from fog_contracts.messages import RefusalCode as Code
 from fog_contracts.site import LiftSite, Site
 from fog_runtime.health import Health
 from fog_runtime.http import ProblemError
@@ -137,7 +139,7 @@ class Building:
         self.told: list[tuple[str, float, str]] = []
         """Its goals: floor, x and id."""
         self.knows, self.carries, self.talks, self.stuck = list(FLOORS), True, True, False
-        self.deaf = False
+        self.deaf, self.period = False, 0.5
         self.chance, self.rng = 0.0, random.Random(0)
 
     def fails(self) -> bool:
@@ -151,8 +153,10 @@ class Building:
     async def hand_over(self, _robot: str, given: HandOver) -> CommandReply:
         if self.fails() or self.deaf:
             raise CommandError("it was not heard")
+        if self.berth.floor != given.origin:  # its agent ends, to start again there
+            return CommandReply.refused(Reason(Code.OTHER_RUN, "the robot starts again on another floor"))
         after = next_berth(self.berth, given)
-        if isinstance(after, Berth) and after != self.berth:
+        if isinstance(after, Berth):
             self.berth, self.at = after, CABIN
         if self.fails():
             raise CommandError("its reply was not heard")
@@ -192,7 +196,7 @@ class Building:
 
     async def go_on(self, rounds: int = ROUNDS, until: Any = lambda: False) -> None:
         for _ in range(rounds):
-            self.clock.advance(0.5)
+            self.clock.advance(self.period)
             self.robot()
             if until():
                 return
@@ -298,12 +302,18 @@ async def test_mission_that_is_cancelled_ends_wherever_the_robot_is_then_and_doe
     for floor in building.floors.values():
         await floor.start()
         await floor.step()  # before it hears of the robot
+    building.talks = False
+    if not building.here.missions.berths:
+        with suppress(OnOtherFloorError):  # a lift that stands there for it may have brought it
+            assert not await building.here.riding.cancel("r1", "anna")
+    building.talks = True
     await building.go_on()
+    assert building.here.missions.is_here("r1")
     assert (building.told[-1], await building.stored()) == (told, [])
     assert (building.lift.session == "") == (building.at != CABIN), "it is held for a robot that is in it"
 
 
-@pytest.mark.parametrize("moment", ["not yet told", "told", "between", "comes", "in the lift"])
+@pytest.mark.parametrize("moment", ["not yet told", "between", "comes", "in the lift"])
 async def test_mission_that_is_cancelled_between_two_floors_ends_outside_the_lift_and_no_restart_takes_it_up(
     building: Building, moment: str
 ) -> None:
@@ -311,7 +321,7 @@ async def test_mission_that_is_cancelled_between_two_floors_ends_outside_the_lif
     await ground.order(DESK, UP, DOWN)
     building.deaf = True
     await building.go_on(until=lambda: "r1" in ground.missions.berths)
-    building.deaf, floor = False, ground if moment in {"not yet told", "told"} else upstairs
+    building.deaf, floor = False, ground if moment == "not yet told" else upstairs
     if moment != "not yet told":
         await ground.step()
         building.talks = moment != "between"
@@ -321,11 +331,6 @@ async def test_mission_that_is_cancelled_between_two_floors_ends_outside_the_lif
     if moment == "in the lift":
         await upstairs.step()
         assert "mission from ground" in floor.riding.waits("r1")
-    if moment == "told":
-        ground.operator.heard = lambda _: building.state()  # its last word there, some seconds long
-        with pytest.raises(OnOtherFloorError, match="has left for upstairs, and its mission with it: cancel it there"):
-            await floor.riding.cancel("r1", "anna")
-        return
     assert await floor.riding.cancel("r1", "anna")
     assert not await floor.riding.cancel("r2", "anna")
     entry = (await floor.store.audit(limit=1)).entries[0]
@@ -336,6 +341,34 @@ async def test_mission_that_is_cancelled_between_two_floors_ends_outside_the_lif
     await building.go_on()
     assert building.told[-1][:2] == ("upstairs", WAIT)
     assert (building.stops, await building.stored(), building.lift.session) == ([], [], "")
+
+
+@pytest.mark.parametrize("told", [True, False])
+async def test_cancellation_that_the_robot_does_not_accept_is_refused_each_time_and_its_mission_goes_on(
+    building: Building, monkeypatch: pytest.MonkeyPatch, *, told: bool
+) -> None:
+    ground = building.floors["ground"]
+
+    async def in_fault(*_: object) -> CommandReply:
+        assert not await asyncio.wait_for(ground.riding.cancel("r2", "anna"), 1.0), "it waits for no other robot"
+        return CommandReply.refused(Reason(Code.FAULT_LATCHED, "the robot is in FAULT"))
+
+    await ground.order(DESK, UP, DOWN)
+    building.deaf = True
+    await building.go_on(until=lambda: "r1" in ground.missions.berths)
+    building.deaf = False
+    if told:
+        await ground.step()
+    with monkeypatch.context() as patched:
+        patched.setattr(ground.operator, "heard", lambda _: building.state())  # its last word, some seconds long
+        if not told:
+            patched.setattr(ground.operator, "hand_over", in_fault)
+        for _ in range(2):
+            with pytest.raises(OnOtherFloorError, match=r"cancel it there, or try again here, .*: the robot"):
+                await ground.riding.cancel("r1", "anna")
+    assert "cancel" not in {entry.action for entry in (await ground.store.audit(limit=9)).entries}
+    await building.go_on()
+    assert building.stops == [("upstairs", 3.0), ("upstairs", 4.0), ("ground", 2.0)]
 
 
 @pytest.mark.parametrize("stops", [[DESK, DOWN], [UP, DESK, DOWN]], ids=["the first stop there", "a later one"])
@@ -353,6 +386,8 @@ async def test_mission_to_a_place_waits_until_the_places_are_known_and_says_so(
     assert "60 s at most" in upstairs.riding.waits("r1")
     if told != "never":
         upstairs.places = known if told == "desk" else {}
+    else:
+        building.period = 2.5
     await building.go_on(until=lambda: "r1" not in upstairs.riding._waits)
     await building.go_on()
     if told == "desk":

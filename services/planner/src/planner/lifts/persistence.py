@@ -76,6 +76,7 @@ class RidePersistence(MissionPersistence):
         super().stand_by()
         self.berths.clear()
         self.at_goal.clear()
+        self._undecided.clear()
 
     def end(self, robot: str, goal_id: str) -> None:
         """Mark a reached goal for its end; a ride goes on from there."""
@@ -208,19 +209,22 @@ class RidePersistence(MissionPersistence):
             await self._put(robot, said, audit)
         _log.info("robot_arrived", robot=robot, epoch=said.epoch, who=who)
 
-    async def cancel_carried(self, robot: str, who: str, expected: str | None = None) -> HandOver | None:
-        """Cancel the mission that a robot takes along, unless this floor has given it already; None if there is none.
+    def without_mission(self, robot: str, who: str, expected: str | None = None) -> HandOver | None:
+        """Return a robot's hand-over without the mission that it takes along.
 
-        Returns the hand-over without it. Raises `StoreError`.
+        None if there is none, or if this floor has given it already.
         """
+        given = known.came_by if (known := self.berths.get(robot)) is not None else None
+        if given is None or not carries(given, expected) or f"{robot}/{given.epoch}" in self.begun:
+            return None
+        return structs.replace(given, goal=OUT, mission=None, who=who, id=secrets.token_hex(8))
+
+    async def cancel_carried(self, robot: str, known: Berth, changed: HandOver) -> None:
+        """Cancel the mission that a robot takes along: `changed` is its hand-over without. Raises `StoreError`."""
         async with self._lock:
-            known = self.berths.get(robot)
-            given = None if known is None else known.came_by
-            if known is None or given is None or not carries(given, expected) or f"{robot}/{given.epoch}" in self.begun:
-                return None
-            changed = structs.replace(given, goal=OUT, mission=None, who=who, id=secrets.token_hex(8))
-            await self._note(robot, structs.replace(known, came_by=changed), who)
-        return changed
+            if self.berths.get(robot) != known:
+                raise StoreError(_CHANGED)
+            await self._note(robot, structs.replace(known, came_by=changed), changed.who)
 
     async def cancel_coming(self, robot: str, who: str, given: HandOver) -> None:
         """Cancel the mission of a robot that is on its way here, whatever it takes along. Raises `StoreError`.

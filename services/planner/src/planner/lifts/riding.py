@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+from collections import defaultdict
 from typing import TYPE_CHECKING, Final, Protocol
 
 from msgspec import structs
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import Berth, HandOver, LiftState, OutOfService, Pose, Refusal, RefusalCode, Stop
+from fog_contracts.messages import Berth, HandOver, LiftState, OutOfService, Pose, Refusal, Stop
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.http import ProblemError
@@ -81,7 +82,8 @@ class Riding:
         self._created = clock.now()
         self._waits: dict[str, tuple[str, float, float]] = {}
         """By robot: for which place it waits until the site's places are known, since when, and until when at least."""
-        self._giving = asyncio.Lock()
+        self._giving: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        """By robot: held while it is given its goal, or its mission is cancelled."""
         service.missions.site = site.id
         service.missions.leg_to = self.leg_to
 
@@ -161,8 +163,8 @@ class Riding:
         known, name, now = self._service.places, stop.place or "", self._clock.now()
         if known is None:
             before, since, until = self._waits.get(robot, (name, now, now))
-            if before != name or now > until:
-                since = now  # that was another wait, which has ended
+            if before != name or now > until + PLACES_S:  # else the same wait, however seldom it is asked for
+                since = now
             if now - since < PLACES_S:
                 self._waits[robot] = name, since, now + _SEEN_S
                 return None
@@ -178,10 +180,10 @@ class Riding:
         """End a robot's mission, also one that it takes along to another floor; False when it has none.
 
         Of that no stop is left: the robot finishes its ride, and drives out of the lift. Raises `OnOtherFloorError`
-        for one that only the other floor can cancel, `MissionConflictError` and `StoreError`.
+        for one that goes on, since only the other floor can cancel it, `MissionConflictError` and `StoreError`.
         """
         missions, operator = self._service.missions, self._service.operator
-        async with self._giving:  # what is being given to it is in force then
+        async with self._giving[robot]:  # what is being given to it is in force then
             if await missions.cancel(robot, who, expected):
                 return True
             known = missions.berths.get(robot)
@@ -192,27 +194,44 @@ class Riding:
                 if coming is not None:
                     await missions.cancel_coming(robot, who, coming)
                     return True
-            if known is None or not carries(known.came_by, expected):
+            changed = missions.without_mission(robot, who, expected)
+            if known is None or changed is None:
                 return False
-            changed = None if away else await missions.cancel_carried(robot, who, expected)
-            if not left:
-                return changed is not None
-            if changed is not None:
-                try:
-                    if (await operator.hand_over(robot, changed)).code != RefusalCode.OTHER_BERTH:
-                        return True
-                except CommandError as error:
-                    _log.info("ride_not_cancelled", robot=robot, reason=str(error))
-            reason = f"it has left for {known.floor}, and its mission with it: cancel it there"
-            raise OnOtherFloorError(robot, OutOfService(id="floor", reason=reason, by=who, since=0.0))
+            if left:
+                await self._leave_without(robot, changed, away=away)
+            await missions.cancel_carried(robot, known, changed)
+            return True
+
+    async def _leave_without(self, robot: str, changed: HandOver, *, away: bool) -> None:
+        """Let a robot leave without its mission; raises `OnOtherFloorError` unless it accepts that.
+
+        It may have accepted the hand-over with its mission before: this floor's record is changed afterwards only.
+        """
+        reason = f"it has left for {changed.floor}, and its mission with it: cancel it there"
+        if not away:
+            try:
+                reply = await self._service.operator.hand_over(robot, changed)
+                if reply.accepted:
+                    return
+                why = reply.reason
+            except CommandError as error:
+                why = str(error)
+            reason += f", or try again here, where it did not accept that: {why}"
+        raise OnOtherFloorError(robot, OutOfService(id="floor", reason=reason, by=changed.who, since=0.0))
 
     def _coming(self, robot: str, known: Berth | None, who: str) -> HandOver | None:
-        """Return the hand-over by which a robot is on its way here, as far as a lift shows that; None if none does."""
+        """Return the hand-over by which a robot is on its way here, as far as a lift shows that; None if none does.
+
+        Raises `OnOtherFloorError` while it may as well be this floor's own, which called the lift to go away.
+        """
         for lift in self._site.lifts:
             state = self._lift(lift.id)
             name, _, number = ("" if state is None else state.session_id).rpartition("/")
             if state is None or state.destination_floor != self._site.id or name != robot or not number.isdecimal():
                 continue
+            if robot not in self._service.missions.said and known is None and state.current_floor == self._site.id:
+                reason = f"the lift {lift.id} is here for it, and nothing was heard of it yet: try again once it is"
+                raise OnOtherFloorError(robot, OutOfService(id="lift", reason=reason, by=who, since=0.0))
             if (epoch := int(number)) > (0 if known is None else known.epoch):
                 others = (floor for floor in lift.floors if floor != self._site.id)
                 origin = next(others) if known is None else known.floor
@@ -307,7 +326,7 @@ class Riding:
             lift = self._lift(given.lift)
             if given.lift is not None and (lift is None or not lift.serves(name, self._site.id)):
                 return
-            async with self._giving:
+            async with self._giving[robot]:
                 await self._give(robot, name, given)
         if given.lift is None or is_out:
             await self._service.missions.settle(robot)

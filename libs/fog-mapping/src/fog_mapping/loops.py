@@ -35,6 +35,7 @@ _MOST_AROUND_M: Final = 9.5
 """How much of the way to either side of a place counts at most where a stretch is looked for far from it."""
 _STRETCH_EVERY_M: Final = 2.5
 _STRETCH_HALF_M: Final = 2.5
+_LEAST_SCANS: Final = 3
 _LEAST_WAY_M: Final = 12.0
 """Two stretches of the way must be so far apart along it to be a loop, between their middles: no scan is in both."""
 _NEAR_M: Final = 3.0
@@ -222,9 +223,10 @@ class LoopSearch:
         half: tuple[float, float],
         half_turn: float,
     ) -> _Match:
-        points, lines = thinned(
-            *cloud(self._scans, poses, self._around(second, _STRETCH_HALF_M), poses[second]), _THIN_M
-        )
+        stretch = self._around(second, _STRETCH_HALF_M)
+        if len(stretch) < _LEAST_SCANS:
+            return _Match(None)
+        points, lines = thinned(*cloud(self._scans, poses, stretch, poses[second]), _THIN_M)
         guess = tuple(between(poses[first], poses[second]))
         best = reference.search(points, guess, half, half_turn, _TURN_STEP, _LEAST_SCORE)
         if best is None:
@@ -236,7 +238,8 @@ class LoopSearch:
         excluded = Excluded(best.pose, _SAME_M, _SAME_RAD)
         other = reference.search(points, guess, half, half_turn, _TURN_STEP, _ALIKE * best.score, excluded)
         if other is not None:
-            off = between(step, np.array(other.pose))
+            off = np.array(other.pose) - step
+            off[2] = math.remainder(off[2], math.tau)
             if off @ information @ off > _EXPLAINED:
                 return _Match(None, several=True)
         edge = Edge(first, second, step, information + _FLOOR * np.eye(3), loop=True)
@@ -268,12 +271,15 @@ class LoopSearch:
         apart &= np.abs(self._way[middles] - self._way[place.middle]) >= _LEAST_WAY_M
         near = np.flatnonzero(apart & (off <= most) & (squares <= _SIGMAS**2))
         for index in near[np.argsort(away[near], kind="stable")].tolist():
-            # Looked for again once it is clearly more certain where.
-            if max(_LEAST_M, off[index]) >= _REPEATED * self._tried.get((number, index), math.inf):
+            pair, size = (number, index), max(_LEAST_M, float(off[index]))
+            # Looked for again once it is clearly more certain where; or less, if it was not found where it should be.
+            lost = pair in self._found and self._found[pair].found is None
+            tried = self._tried.get(pair, math.inf)
+            if size >= _REPEATED * tried and not (lost and tried < _REPEATED * size):
                 continue
             query = self._queries[index]
             if not self._is_refused(place, query):
-                self._tried[number, index] = max(_LEAST_M, float(off[index]))
+                self._tried[pair] = size
                 half_x, half_y, turn = _SIGMAS * np.sqrt(np.diagonal(covariance[index]).clip(0.0))
                 yield (
                     index, (max(_LEAST_M, float(half_x)), max(_LEAST_M, float(half_y))),
@@ -291,5 +297,5 @@ class LoopSearch:
 def _stretches(way: NDArray[np.float64], every: float, half: float) -> Iterator[Stretch]:
     for at in np.arange(0.0, way[-1] + every, every):
         inside = np.nonzero(np.abs(way - at) <= half)[0]
-        if len(inside) >= 3:
+        if len(inside) >= _LEAST_SCANS:
             yield Stretch(int(np.argmin(np.abs(way - at))), int(inside[0]), int(inside[-1]))

@@ -98,7 +98,7 @@ def test_map_that_others_were_laid_onto_takes_over_what_has_stood(folder, logs):
 
 
 def test_drive_through_another_building_is_refused(folder):
-    elsewhere = drive(folder, "elsewhere", 5, floor((1, 1, 14, 3.5), (1, 1, 4, 9), (8, 1, 14, 9)))
+    elsewhere = drive(folder, "elsewhere", 5, floor((1, 1, 14.6, 4.2), (1, 1, 3, 9.5), (8.4, 1, 14.6, 8)))
     refused = run("diff", folder / "floor.yaml", elsewhere)
     assert refused.exit_code == 1
     assert "can't be compared with" in refused.output

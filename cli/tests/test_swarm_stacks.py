@@ -128,10 +128,14 @@ def machine_of(service: dict[str, Any]) -> str:
 
 
 def test_floor_with_three_machines_runs_twice_and_redis_three_times(out: Path) -> None:
-    machines = {name: machine_of(service) for name, service in made(out, TWICE)["services"].items()}
+    services = made(out, TWICE)["services"]
+    machines = {name: machine_of(service) for name, service in services.items()}
     assert {name for name, machine in machines.items() if machine == "3"} == {"redis-3", "sentinel-3"}
     first = {name for name, machine in machines.items() if machine == "1"} - {"prometheus", "grafana"}
     assert {f"{name}-2" for name in first} == {name for name, machine in machines.items() if machine == "2"}
+    ends = {name for name, each in services.items() if each.get("sysctls") == {"net.ipv4.tcp_retries2": 5}}
+    wanted = {"planner", "map-service", "hazard-aggregator", "console-service", "zenoh"}
+    assert ends == wanted | {f"{name}-2" for name in wanted}, "connections to a machine that is cut off end in seconds"
 
 
 def test_files_of_the_machines_are_together_the_whole_stack(out: Path) -> None:

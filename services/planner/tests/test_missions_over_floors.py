@@ -96,8 +96,10 @@ class Floor:
         self.riding = Riding(cast("Any", self), self.site, cast("Any", self.building), cast("Any", self.clock))
         await self.missions.lead(-1, confirmed=True)
 
-    def heard(self, _robot: str) -> RobotState | None:
-        return self.building.state() if self.building.berth.floor == self.name and self.building.talks else None
+    def heard(self, robot: str) -> RobotState | None:
+        berth = self.building.berth
+        told = self.missions.said.get(robot, berth) == berth  # else all that it has heard is old
+        return self.building.state() if berth.floor == self.name and self.building.talks and told else None
 
     def fresh_state(self, robot: str) -> RobotState:
         if (state := self.heard(robot)) is None:
@@ -458,6 +460,26 @@ async def test_robot_that_can_take_no_mission_along_any_more_is_not_sent_into_th
     await building.go_on()
     assert [told[:2] for told in dict.fromkeys(building.told)] == [("ground", WAIT)]
     assert (await building.stored(), building.here.missions.berths, building.lift.session) == ([], {}, "")
+
+
+async def test_robot_that_lost_its_record_leaves_again_once_it_is_put_back_and_no_floor_tells_it_what_is_long_done(
+    building: Building,
+) -> None:
+    ground, upstairs = building.floors.values()
+    await ground.order(UP, DOWN)
+    await building.go_on(until=lambda: ("ground", 2.0) in building.stops)
+    await building.go_on(4)
+    building.berth = Berth(floor="ground")
+    building.robot()
+    assert await ground.missions.put_back("r1", "anna")
+    await ground.order(UP)
+    await building.go_on()
+    assert (building.berth.floor, upstairs.missions.standing("r1")) == ("upstairs", "stale"), "not sent back"
+    assert await upstairs.missions.put_back("r1", "anna")
+    await upstairs.order(UP_AGAIN, stop("ground", 3.0))
+    await building.go_on()
+    assert building.stops == [("upstairs", 4.0), ("ground", 2.0), ("upstairs", 5.0), ("ground", 3.0)]
+    assert (await building.stored(), building.lift.session) == ([], "")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ that it is there before it sends it anywhere. No message passes between the floo
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from fog_contracts.messages import Berth, Reason, RefusalCode
 
@@ -17,6 +17,19 @@ if TYPE_CHECKING:
 Standing = Literal["here", "arrives", "leaves", "stale"]
 """What a floor makes of a robot that it hears: it is this floor's; it has just come; it was not told yet, or has not
 understood, that it was handed over; its own record is older than the floor's, and it is sent nowhere."""
+
+_ID: Final = 16
+"""So many characters of a hand-over's id are its own; behind them is that of the one before."""
+
+
+def id_after(before: str, own: str) -> str:
+    """Return the id of a hand-over that follows the one with the id `before` (empty: none, or an unknown one)."""
+    return own[:_ID] + before[:_ID]
+
+
+def id_before(given: HandOver) -> str:
+    """Return the id of the hand-over before; empty if there was none, or for an id of an older floor."""
+    return given.id[_ID:]
 
 
 def next_berth(berth: Berth, given: HandOver) -> Berth | Reason:
@@ -34,7 +47,11 @@ def next_berth(berth: Berth, given: HandOver) -> Berth | Reason:
 
 
 def standing(known: Berth | None, said: Berth, floor: str) -> Standing:
-    """Return what a floor makes of a robot's record (`said`) by its own (`known`; None: it has none)."""
+    """Return what a floor makes of a robot's record (`said`) by its own (`known`; None: it has none).
+
+    A robot that was put back after its record was lost counts anew, and may come by an epoch of before: it is `stale`
+    where it had left by the next one, for what it was told then is long done.
+    """
     before = Berth(floor=floor) if known is None else known
     if said.floor != floor:
         return "stale"
@@ -42,4 +59,6 @@ def standing(known: Berth | None, said: Berth, floor: str) -> Standing:
         return "arrives"
     if before.floor == floor:
         return "here" if said.epoch == before.epoch else "stale"
-    return "leaves" if said.epoch == before.epoch - 1 else "stale"
+    follows = "" if before.came_by is None else id_before(before.came_by)
+    came_by = "" if said.came_by is None else said.came_by.id
+    return "leaves" if said.epoch == before.epoch - 1 and came_by.startswith(follows) else "stale"

@@ -89,7 +89,10 @@ class Store(LearnedStore):
         return await self._readable_records(_BERTHS.name, Berth)
 
     async def put_berth(self, robot: str, berth: Berth, known: Berth | None, audit: Audit) -> Outcome:
-        """Write durably on which floor a robot is, if what is stored is what is `known` (None: nothing)."""
+        """Write durably on which floor a robot is, if what is stored is of the epoch that is `known`.
+
+        None: nothing is stored. Epoch 0 is as good as that: the robot was put back here with a record that is new.
+        """
         return await self._swap(_BERTHS, robot, berth, "0" if known is None else str(known.epoch), audit)
 
     async def schedules(self) -> dict[str, ScheduledMission]:

@@ -114,9 +114,10 @@ class HandOver(Message, frozen=True, kw_only=True):
     """A robot's way from the floor `origin` to `floor`, which it carries itself (ADR 76).
 
     `epoch`: the robot's count of hand-overs after this one. `lift`: by which it rides; None: people carry it. `goal`:
-    where it goes then. `who`: who sent it. `id`: no other one's, whatever the epochs (they may be restored); robots of
-    before give it back empty. `mission`: what the robot goes on with there, whose present stop is the goal; its stops
-    that name no floor are there. Only a robot that `carries_missions` understands it.
+    where it goes then. `who`: who sent it. `id`: no other one's, whatever the epochs (they may be restored), and behind
+    it that of the hand-over before; robots of before give it back empty. `mission`: what the robot goes on with there,
+    whose present stop is the goal; its stops that name no floor are there. Only a robot that `carries_missions`
+    understands it.
     """
 
     origin: Id

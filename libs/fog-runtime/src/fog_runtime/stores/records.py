@@ -112,7 +112,7 @@ local current = redis.call('HGET', KEYS[3], id)
 local outcome = 'ok'
 if current and current == data then
   -- A repeated attempt whose first reply was lost.
-elseif expected == '0' and current then
+elseif expected == '0' and current and version_of(current) ~= 0 then
   outcome = 'exists'
 elseif not current and (data == '' or (expected ~= '0' and expected ~= '*')) then
   outcome = 'missing'

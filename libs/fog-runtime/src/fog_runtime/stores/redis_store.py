@@ -309,9 +309,10 @@ class RedisStore:
     ) -> Outcome:
         """Write a record durably, or delete it (None), with an audit entry, if the stored version is `expected`.
 
-        `expected` is the version as text, `0` when none may be stored yet, or ANY; `before` is the previous value for
-        the audit entry when none was stored. A repeated attempt, after the first reply was lost, is `ok` for a write
-        and `missing` for a deletion. A new record's version must be above `_floor`, or the outcome is `stale`.
+        `expected` is the version as text, `0` when none may be stored yet but one of version 0, or ANY; `before` is the
+        previous value for the audit entry when none was stored. A repeated attempt, after the first reply was lost, is
+        `ok` for a write and `missing` for a deletion. A new record's version must be above `_floor`, or the outcome is
+        `stale`.
         """
         data, attempt = b"" if record is None else msgspec.json.encode(record), audit.attempt
         names = ("generation", "writes", table.name, f"audit:{table.subject}", "floors")

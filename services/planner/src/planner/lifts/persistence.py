@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import structs
 
-from fog_contracts.handover import next_berth, standing
+from fog_contracts.handover import id_after, id_before, next_berth, standing
 from fog_contracts.messages import Berth, FloorGoal, HandOver, OutOfService, Reason, RobotGoal
 from fog_runtime import logs
 from fog_runtime.stores.redis_connection import StoreError
@@ -173,10 +173,11 @@ class RidePersistence(MissionPersistence):
         """
         ride, known = stored.ride, self.berths.get(robot)
         assert ride is not None
-        before = known or Berth(floor=self.site)
+        before, said = known or Berth(floor=self.site), self.said.get(robot)
+        came_by = None if said is None else said.came_by
         given = HandOver(
             origin=self.site, floor=ride.floor, epoch=before.epoch + 1, lift=ride.lift, goal=ride.goal, who=ride.who,
-            id=secrets.token_hex(8),
+            id=id_after("" if came_by is None else came_by.id, secrets.token_hex(8)),
             mission=None if stored.tour is None else carried(stored.tour, self.site, ride.floor),
         )  # fmt: skip
         after = next_berth(before, given)
@@ -217,7 +218,8 @@ class RidePersistence(MissionPersistence):
         given = known.came_by if (known := self.berths.get(robot)) is not None else None
         if given is None or not carries(given, expected) or f"{robot}/{given.epoch}" in self.begun:
             return None
-        return structs.replace(given, goal=OUT, mission=None, who=who, id=secrets.token_hex(8))
+        new = id_after(id_before(given), secrets.token_hex(8))
+        return structs.replace(given, goal=OUT, mission=None, who=who, id=new)
 
     async def cancel_carried(self, robot: str, known: Berth, changed: HandOver) -> None:
         """Cancel the mission that a robot takes along: `changed` is its hand-over without. Raises `StoreError`."""
